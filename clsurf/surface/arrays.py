@@ -1,0 +1,69 @@
+"""Checks and conversions shared by the plain data types."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def frozen(name: str, value, shape: tuple, dtype) -> NDArray:
+    """Return `value` as a read-only, C-contiguous array of `dtype`, after checking its shape.
+
+    Parameters
+    ----------
+    name : str
+        Used in the message of a ValueError.
+    shape : tuple of int or str
+        Expected shape; a string stands for a free length and names it in the message.
+    """
+    array = np.ascontiguousarray(value, dtype=dtype)
+    fits = array.ndim == len(shape) and all(isinstance(want, str) or got == want
+                                            for got, want in zip(array.shape, shape, strict=True))
+    if not fits:
+        wanted = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
+        raise ValueError(f"{name}: expected an array of shape {wanted}, got {np.shape(value)}")
+    if array is value and array.flags.writeable:
+        array = array.view()  # the caller's own array stays writeable
+    array.flags.writeable = False
+    return array
+
+
+def bounds_of(points: NDArray, origin: NDArray) -> NDArray:
+    """Return the bounding box (2, 3) float64 in world space of `points` (n, 3) relative to `origin`."""
+    if len(points) == 0:
+        return np.full((2, 3), np.nan)
+    return np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64) + origin
+
+
+def recentred(points, origin) -> tuple[NDArray, NDArray]:
+    """Split world positions into float32 offsets and a float64 origin.
+
+    float64 input without an origin is moved to the centre of its box, so that a survey coordinate keeps its
+    millimetres; float32 input is kept as it is.
+
+    Parameters
+    ----------
+    points : array_like
+        (n, 3) positions, any real dtype; with `origin` given, relative to it.
+    origin : array_like or None
+        (3,) float64.
+
+    Returns
+    -------
+    points : (n, 3) float32
+    origin : (3,) float64
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"positions: expected an array of shape (n, 3), got {points.shape}")
+    if origin is not None:
+        return np.ascontiguousarray(points, np.float32), np.asarray(origin, np.float64)
+    if points.dtype == np.float32 or len(points) == 0:
+        return np.ascontiguousarray(points, np.float32), np.zeros(3)
+    points = points.astype(np.float64, copy=False)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        return points.astype(np.float32), np.zeros(3)
+    # Halving before adding keeps the centre of a box near the largest float64 finite.
+    low, high = (points.min(axis=0), points.max(axis=0)) if finite.all() else (
+        points[finite].min(axis=0), points[finite].max(axis=0))
+    origin = low / 2 + high / 2
+    return (points - origin).astype(np.float32), origin

@@ -1,0 +1,46 @@
+"""Shared fixtures: the device under test, and the real scans."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from clsurf.device import open_device
+
+_without_data: list[str] = []
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_caches(tmp_path_factory):
+    """Give every pytest-xdist worker its own PoCL cache: concurrent workers break a shared one."""
+    if os.environ.get("PYTEST_XDIST_WORKER") and "POCL_CACHE_DIR" not in os.environ:
+        os.environ["POCL_CACHE_DIR"] = str(tmp_path_factory.mktemp("pocl-cache"))
+
+
+@pytest.fixture(scope="session")
+def device():
+    """The device under test: CLSURF_DEVICE, else PoCL. No device is a failure, not a skip."""
+    return open_device(os.environ.get("CLSURF_DEVICE") or "pocl")
+
+
+def data_folder() -> Path:
+    """Return the folder of real scans: CLSURF_DATA, else `shared/data` beside the checkout."""
+    named = os.environ.get("CLSURF_DATA")
+    return Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def scan_path(name: str) -> Path:
+    """Return the path of a real scan; where the data is missing, the test is skipped and counted in the last line."""
+    path = data_folder() / name
+    if not path.exists():
+        _without_data.append(name)
+        pytest.skip(f"needs the scan {name}: set CLSURF_DATA")
+    return path
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say how many tests lacked their scan; nothing is skipped silently."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    count = sum("needs the scan" in str(report.longrepr) for report in skipped)
+    if count:
+        terminalreporter.write_line(f"{count} tests not run: their scans are missing (CLSURF_DATA names the folder)")
