@@ -209,7 +209,8 @@ class Camera:
     def __repr__(self):
         kind = (f"fov {self.fov:g}" if self.fov is not None else f"height {self.height:g}" if self.height is not None
                 else f"intrinsics {self.intrinsics_size}")
-        return f"Camera({kind}, eye {np.round(self.eye, 6).tolist()}, looks along {np.round(-self.rotation[2], 4).tolist()})"
+        eye, forward = np.round(self.eye, 6).tolist(), np.round(-self.rotation[2], 4).tolist()
+        return f"Camera({kind}, eye {eye}, looks along {forward})"
 
 
 def _looking(forward, up) -> NDArray:
@@ -217,7 +218,8 @@ def _looking(forward, up) -> NDArray:
     forward, up = np.asarray(forward, np.float64), np.asarray(up, np.float64)
     length = np.linalg.norm(forward)
     if forward.shape != (3,) or up.shape != (3,) or not np.isfinite(length) or length == 0:
-        raise InputError("camera: expected an eye, target (or direction) and up of 3 finite numbers, eye and target apart")
+        raise InputError("camera: expected an eye, target (or direction) and up of 3 finite numbers each, eye and "
+                         "target apart")
     back = -forward / length
     right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-9 * max(np.linalg.norm(up), 1e-300):

@@ -79,7 +79,8 @@ class Mesh:
     @property
     def nbytes(self) -> int:
         """Bytes of all arrays."""
-        arrays = (self.vertices, self.faces, self.normals, self.colors, self.uv, self.texture, *self.attributes.values())
+        arrays = (self.vertices, self.faces, self.normals, self.colors, self.uv, self.texture,
+                  *self.attributes.values())
         return sum(a.nbytes for a in arrays if a is not None)
 
     def __repr__(self):

@@ -101,7 +101,8 @@ class SlimSurface:
             put("footprint", (n, 8), np.uint8)
         if self.colors is not None:
             put("colors", (n, 4), np.uint8)
-        if self.child_offset[0] != 0 or self.child_offset[-1] != len(self.children) or np.any(np.diff(self.child_offset) < 0):
+        offset = self.child_offset
+        if offset[0] != 0 or offset[-1] != len(self.children) or np.any(np.diff(offset) < 0):
             raise ValueError(f"child_offset: expected ascending offsets from 0 to {len(self.children)}")
         if len(self.children) and (self.children.min() < 0 or self.children.max() >= n):
             raise ValueError(f"children: expected indices from 0 to {n - 1}")

@@ -1,0 +1,112 @@
+"""What a machine offers clsurf and what it lacks, with the one command that mends each lack."""
+
+import importlib.metadata
+import os
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import DeviceError, Error
+from . import icd
+from .context import Device, all_devices, open_device
+from .sources import kernel_folder
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's report; `mend` is the command that helps, empty where all is well."""
+
+    name: str
+    good: bool
+    detail: str
+    mend: str = ""
+
+
+def examine() -> list[Finding]:
+    """Look at Python, drivers, devices, caches and optional packages; run a small kernel on every device."""
+    findings = [_python(), _kernels(), _cache(), *_drivers()]
+    devices = all_devices()
+    if not devices:
+        findings.append(Finding("device", False, "no OpenCL device found", "pip install pocl-binary-distribution"))
+    findings += [_device(d) for d in devices]
+    findings += [_package("laspy", "LAS and LAZ point clouds"), _package("lazrs", "compressed LAZ"),
+                 _package("trimesh", "mesh formats"), _package("OpenImageIO", "pictures")]
+    return findings
+
+
+def _python() -> Finding:
+    version = ".".join(map(str, sys.version_info[:3]))
+    good = sys.version_info >= (3, 11)
+    return Finding("python", good, version, "" if good else "install Python 3.11 or newer")
+
+
+def _kernels() -> Finding:
+    try:
+        folder = kernel_folder()
+    except Error as error:
+        return Finding("kernels", False, str(error), "pip install --force-reinstall clsurf")
+    return Finding("kernels", True, f"{len(list(folder.rglob('*.cl')))} files in {folder}")
+
+
+def _cache() -> Finding:
+    folder = icd.cache_folder()
+    named = os.environ.get("POCL_CACHE_DIR")
+    if named and not os.access(named if os.path.isdir(named) else os.path.dirname(named) or ".", os.W_OK):
+        return Finding("cache", False, f"POCL_CACHE_DIR={named} cannot be written", "unset POCL_CACHE_DIR")
+    return Finding("cache", True, str(folder))
+
+
+def _drivers() -> list[Finding]:
+    findings = []
+    vendors = os.environ.get("OCL_ICD_VENDORS", "")
+    findings.append(Finding("drivers", True, f"vendors folder {vendors or icd.SYSTEM_VENDORS}"))
+    intel = icd.intel_library()
+    linux = sys.platform.startswith("linux")
+    if linux and intel is None:
+        findings.append(Finding("Intel CPU runtime", True, "not installed (optional; two to three times faster than "
+                                "PoCL on the same processor)", "pip install 'clsurf[intel]'"))
+    elif intel is not None:
+        missing = [name for name in icd.INTEL_NEEDS if not (intel.parent / name).exists()]
+        findings.append(Finding("Intel CPU runtime", not missing, f"{intel}" + (f", lacks {missing}" if missing else ""),
+                                "pip install intel-cmplr-lib-rt" if missing else ""))
+    if icd.nvidia_library():
+        findings.append(Finding("NVIDIA driver", True, icd.nvidia_library()))
+    return findings
+
+
+def _device(cl_device) -> Finding:
+    label = f"{cl_device.name.strip()} ({cl_device.platform.name.strip()})"
+    try:
+        device = open_device(cl_device)
+        check(device)
+    except Error as error:
+        lines = [line for line in str(error).splitlines() if line.strip()]
+        mend = "pip install 'clsurf[intel]'" if "Portable" in cl_device.platform.name else "update its driver"
+        return Finding(label, False, " ".join(lines)[:300], mend)
+    return Finding(label, True, f"{device.kind}, {device.units} units, {device.memory_bytes / 1e9:.1f} GB, {device.version},"
+                   f" driver {device.driver}: compiles and computes")
+
+
+def check(device: Device) -> None:
+    """Compile and run one kernel on `device` and compare its answer.
+
+    Raises
+    ------
+    DeviceError
+        A wrong answer, or a kernel that does not compile.
+    """
+    values = np.linspace(0, 100, 64, dtype=np.float32)
+    source, target = device.upload(values), device.empty(64, np.float32)
+    kernel = device.kernel("common/self_test.cl", constants={"VW": device.lanes})
+    kernel((64 // device.lanes,), (1,), source, target, np.float32(3.0))
+    error = np.abs(device.download(target) - (3 * np.sqrt(values) + 1)).max()
+    if not error < 1e-4:
+        raise DeviceError(f"device {device.name}: a test kernel answers wrongly (off by {error:g})")
+
+
+def _package(name: str, use: str) -> Finding:
+    try:
+        return Finding(name, True, f"{importlib.metadata.version(name)} ({use})")
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, False, f"not installed ({use})", f"pip install {name}")
