@@ -70,7 +70,7 @@ class Device:
     def __repr__(self):
         return f"Device({self.name!r}, {self.platform_name!r}, {self.kind}, {self.units} units)"
 
-    # Kernels --------------------------------------------------------------------------------------------------------
+    # Kernels ------------------------------------------------------------------------------------------------------
 
     def kernel(self, path: str, name: str | None = None, constants: dict | None = None) -> Kernel:
         """Return the kernel `name` (by default the file's stem) of `path`, built once per set of constants.
@@ -93,7 +93,7 @@ class Device:
                 kernel = mine[key, name] = make_kernel(self, *self._programs[key], name)
         return kernel
 
-    # Memory ---------------------------------------------------------------------------------------------------------
+    # Memory -------------------------------------------------------------------------------------------------------
 
     def check_memory(self, **nbytes: int) -> None:
         """Raise DeviceMemoryError where the named buffers would not fit; call it before allocating them."""

@@ -68,7 +68,8 @@ def _drivers() -> list[Finding]:
                                 "PoCL on the same processor)", "pip install 'clsurf[intel]'"))
     elif intel is not None:
         missing = [name for name in icd.INTEL_NEEDS if not (intel.parent / name).exists()]
-        findings.append(Finding("Intel CPU runtime", not missing, f"{intel}" + (f", lacks {missing}" if missing else ""),
+        lack = f", lacks {missing}" if missing else ""
+        findings.append(Finding("Intel CPU runtime", not missing, f"{intel}{lack}",
                                 "pip install intel-cmplr-lib-rt" if missing else ""))
     if icd.nvidia_library():
         findings.append(Finding("NVIDIA driver", True, icd.nvidia_library()))
@@ -84,8 +85,8 @@ def _device(cl_device) -> Finding:
         lines = [line for line in str(error).splitlines() if line.strip()]
         mend = "pip install 'clsurf[intel]'" if "Portable" in cl_device.platform.name else "update its driver"
         return Finding(label, False, " ".join(lines)[:300], mend)
-    return Finding(label, True, f"{device.kind}, {device.units} units, {device.memory_bytes / 1e9:.1f} GB, {device.version},"
-                   f" driver {device.driver}: compiles and computes")
+    return Finding(label, True, f"{device.kind}, {device.units} units, {device.memory_bytes / 1e9:.1f} GB, "
+                   f"{device.version}, driver {device.driver}: compiles and computes")
 
 
 def check(device: Device) -> None:

@@ -41,7 +41,7 @@ def cpu_flags() -> set[str]:
 
 
 def name_processor(device) -> str | None:
-    """Replace "generic" in the record of a PoCL 3.0 CPU device; return the new name, or None where nothing was wrong."""
+    """Replace "generic" in the record of a PoCL 3.0 CPU device; return the new name, None where nothing was wrong."""
     if platform.machine() != "x86_64" or not os.path.exists("/proc/self/mem"):
         return None
     if "PoCL 3.0" not in device.platform.version or not device.version.rstrip().endswith("-generic"):

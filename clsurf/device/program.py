@@ -30,6 +30,7 @@ class Kernel:
         self.count = len(dtypes)
 
     def __call__(self, global_size, local_size, *arguments):
+        """Enqueue a launch; with a profile, wait for it and record its time."""
         if len(arguments) != self.count:
             raise TypeError(f"kernel {self.label}: expected {self.count} arguments, got {len(arguments)}")
         if 0 in global_size:

@@ -13,7 +13,8 @@ import pyopencl.cltypes as cltypes
 from ..errors import DeviceError
 
 INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]+"([^"]+)"[ \t]*$', re.M)
-SIGNATURE = re.compile(r"__kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s+)*void\s+(?:__attribute__\s*\(\(.*?\)\)\s+)*(\w+)\s*\(([^)]*)\)", re.S)
+ATTRIBUTES = r"(?:__attribute__\s*\(\(.*?\)\)\s+)*"
+SIGNATURE = re.compile(rf"__kernel\s+{ATTRIBUTES}void\s+{ATTRIBUTES}(\w+)\s*\(([^)]*)\)", re.S)
 SCALARS = {"char": np.int8, "uchar": np.uint8, "short": np.int16, "ushort": np.uint16, "int": np.int32,
            "uint": np.uint32, "long": np.int64, "ulong": np.uint64, "float": np.float32, "double": np.float64}
 SCALARS |= {f"{name}{n}": getattr(cltypes, f"{name}{n}") for name in ("int", "uint", "float") for n in (2, 4, 8, 16)}
@@ -26,7 +27,8 @@ def kernel_folder() -> Path:
     for folder in (package / "kernels", package.parent / "kernels"):
         if (folder / "common").is_dir():
             return folder
-    raise DeviceError(f"kernel sources: expected a folder 'kernels' in or beside {package}, found none: reinstall clsurf")
+    raise DeviceError(f"kernel sources: expected a folder 'kernels' in or beside {package}, found none: reinstall "
+                      "clsurf")
 
 
 def expanded(path: str) -> str:
@@ -49,7 +51,7 @@ def _expand(path: str, seen: set) -> str:
         if match[1] not in seen:
             parts.append(_expand(match[1], seen))
         line = text.count("\n", 0, match.end()) + 2
-        parts.append(f'\n#line {line - 1} "{path}"')
+        parts.append(f'\n#line {line} "{path}"')
         at = match.end()
     parts.append(text[at:])
     return "".join(parts)

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
+
 
 def frozen(name: str, value, shape: tuple, dtype) -> NDArray:
     """Return `value` as a read-only, C-contiguous array of `dtype`, after checking its shape.
@@ -50,6 +52,11 @@ def recentred(points, origin) -> tuple[NDArray, NDArray]:
     -------
     points : (n, 3) float32
     origin : (3,) float64
+
+    Raises
+    ------
+    InputError
+        An extent beyond float32.
     """
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -66,4 +73,7 @@ def recentred(points, origin) -> tuple[NDArray, NDArray]:
     low, high = (points.min(axis=0), points.max(axis=0)) if finite.all() else (
         points[finite].min(axis=0), points[finite].max(axis=0))
     origin = low / 2 + high / 2
+    if (high / 2 - low / 2).max() > np.finfo(np.float32).max:
+        raise InputError(f"positions: expected an extent that float32 holds, got {low.tolist()} to {high.tolist()}: "
+                         "drop the outliers or scale the scan down")
     return (points - origin).astype(np.float32), origin

@@ -70,5 +70,5 @@ class PointCloud:
     def __repr__(self):
         low, high = self.bounds
         kept = [name for name in ("normals", "colors", "scanners") if getattr(self, name) is not None]
-        return (f"PointCloud({len(self.points):,} points{', ' + ', '.join(kept) if kept else ''}, {self.nbytes:,} bytes, "
-                f"bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
+        return (f"PointCloud({len(self.points):,} points{', ' + ', '.join(kept) if kept else ''}, "
+                f"{self.nbytes:,} bytes, bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
