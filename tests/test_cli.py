@@ -1,0 +1,107 @@
+"""The command line as a user meets it."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import clsurf
+from clsurf.cli import main, parsed_size
+
+COMMANDS = ["demo", "devices", "doctor", "info", "build", "convert", "render", "bench"]
+
+
+@pytest.fixture
+def on_device(monkeypatch, device):
+    """Commands without --device use the device under test."""
+    monkeypatch.setenv("CLSURF_DEVICE", "intel" if "Intel" in device.platform_name else "pocl")
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A small coloured cloud with normals on disk."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(4000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = np.full((4000, 4), 255, np.uint8)
+    colors[:, 0] = 20
+    path = tmp_path / "ball.ply"
+    clsurf.save(clsurf.PointCloud(normals * 2 + 100, normals=normals, colors=colors), path)
+    return path
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help(command, capsys):
+    assert main([command, "--help"]) == 0
+    assert "Usage" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("arguments", "says"), [
+    (["frobnicate"], "frobnicate"), (["info", "gone.ply"], "gone.ply"), (["info"], "path"),
+    (["build", "gone.ply", "x.png"], "ends in .clsurf"), (["render", "a.ply", "b.png", "--size", "big"], "WIDTHxHEIGHT"),
+    (["devices", "--no-such"], "no-such"), (["build", "a.ply", "b.clsurf", "--degree", "7"], "degree"),
+    (["build", "gone.ply", "b.clsurf", "--device", "unobtainium"], ""),
+    (["bench", "nothing"], "nothing"), (["bench", "compare", "one.json"], "two JSON files"),
+])
+def test_a_users_mistake_is_one_line_and_exit_code_2(arguments, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert said[-1].startswith("clsurf: ") and says in said[-1] and "Traceback" not in "".join(said)
+    assert not list(tmp_path.iterdir())  # nothing half-written
+
+
+def test_garbage_is_one_line(capsys, tmp_path):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(b"\x00garbage" * 100)
+    assert main(["info", str(path)]) == 2
+    assert "bad.ply" in capsys.readouterr().err
+
+
+def test_build_info_render_convert(scan, tmp_path, capsys, on_device):
+    surface, exr, png = tmp_path / "ball.clsurf", tmp_path / "ball.exr", tmp_path / "ball.png"
+    assert main(["build", str(scan), str(surface)]) == 0
+    assert "surface: " in capsys.readouterr().err
+    assert main(["info", str(surface)]) == 0
+    said = capsys.readouterr().out
+    assert "leaves" in said and "T_MDL 0.01" in said
+    assert main(["render", str(surface), str(png), "--size", "90x70"]) == 0
+    assert main(["render", str(scan), str(exr), "--size", "90x70", "--quiet"]) == 0
+    from clsurf.io.images import read_image
+    picture = np.asarray(read_image(png))
+    assert picture.shape[:2] == (70, 90)
+    assert picture[0, 0, 0] != picture[35, 45, 0] or picture[0, 0, 1] != picture[35, 45, 1]  # the ball is in the middle
+    assert exr.stat().st_size > 1000
+    assert main(["convert", str(surface), str(tmp_path / "ball.slim2t")]) == 0
+    assert main(["convert", str(scan), str(tmp_path / "ball.xyz")]) == 0
+    assert len(clsurf.load(tmp_path / "ball.xyz").points) == 4000
+
+
+def test_quiet_says_nothing(scan, tmp_path, capsys, on_device):
+    assert main(["build", str(scan), str(tmp_path / "b.clsurf"), "--quiet"]) == 0
+    out = capsys.readouterr()
+    assert out.out == "" and out.err == ""
+
+
+def test_demo(tmp_path, capsys, on_device):
+    picture = tmp_path / "demo.png"
+    assert main(["demo", str(picture), "--size", "160x120"]) == 0
+    said = capsys.readouterr().err
+    assert str(picture) in said and "build the surface" in said and picture.stat().st_size > 3000
+
+
+def test_devices_and_doctor(capsys):
+    assert main(["devices"]) == 0 and "* " in capsys.readouterr().out
+    assert main(["doctor"]) == 0 and "ok " in capsys.readouterr().out
+
+
+def test_a_closed_pipe_is_no_error():
+    command = f"{sys.executable} -m clsurf doctor | head -n 1"
+    done = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True)
+    assert "Traceback" not in done.stderr and done.returncode == 0
+
+
+@pytest.mark.parametrize(("text", "size"), [("640x480", (640, 480)), ("1X1", (1, 1))])
+def test_sizes(text, size):
+    assert parsed_size(text) == size
