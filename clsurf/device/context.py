@@ -66,6 +66,7 @@ class Device:
         self._lock = threading.Lock()
         self._programs: dict = {}
         self._kernels = threading.local()
+        self.in_flight: list = []  # arguments of launches that may still run: their host memory must outlive them
 
     def __repr__(self):
         return f"Device({self.name!r}, {self.platform_name!r}, {self.kind}, {self.units} units)"
@@ -105,8 +106,8 @@ class Device:
                                     f"{nbytes[largest] / 1e9:.2f} GB), has {limit / 1e9:.2f} GB: use a smaller scan or "
                                     "picture, or another device (clsurf devices)")
         if largest and nbytes[largest] > self.largest_buffer_bytes:
-            raise DeviceMemoryError(f"device {self.name}: {largest} needs {nbytes[largest] / 1e9:.2f} GB, one buffer may "
-                                    f"have {self.largest_buffer_bytes / 1e9:.2f} GB: use a smaller scan or picture")
+            raise DeviceMemoryError(f"device {self.name}: {largest} needs {nbytes[largest] / 1e9:.2f} GB, one buffer "
+                                    f"may have {self.largest_buffer_bytes / 1e9:.2f} GB: use a smaller scan or picture")
 
     def empty(self, shape, dtype) -> DeviceArray:
         """Return an uninitialised device array."""
@@ -158,9 +159,11 @@ class Device:
             cl.enqueue_copy(self.queue, out, array.buffer, is_blocking=True)
             return out
         # Mapping is what makes the host's view of the pages valid.
+        done, self.in_flight = self.in_flight, []
         mapped, _ = cl.enqueue_map_buffer(self.queue, array.buffer, cl.map_flags.READ, 0, array.shape, array.dtype,
                                           is_blocking=True)
         mapped.base.release(self.queue)
+        del done  # the queue is in order: every launch before the mapping has ended
         return array.host.copy() if copy else array.host
 
     def trim(self) -> None:
@@ -170,7 +173,9 @@ class Device:
 
     def finish(self) -> None:
         """Wait until every launch has ended."""
+        done, self.in_flight = self.in_flight, []
         self.queue.finish()
+        del done
 
 
 def _host_memory_bytes() -> int:

@@ -42,6 +42,7 @@ class Kernel:
         profile = self.device.profile
         if profile is None:
             cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, global_size, local_size)
+            self.device.in_flight.append(arguments)
             return
         self.device.queue.finish()
         start = time.perf_counter()
