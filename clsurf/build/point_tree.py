@@ -1,0 +1,113 @@
+"""Points sorted along the Morton curve, with a 16-wide tree of boxes for ball queries on the device."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device
+from ..device.arrays import DeviceArray
+
+BLOCK = 16  # points of a block, children of a node
+
+
+@dataclass(eq=False)
+class PointTree:
+    """Sorted points on a device, unit-diagonal coordinates.
+
+    Attributes
+    ----------
+    count, padded : int
+        Points, and points padded to whole blocks.
+    order : (count,) int32
+        Index of every sorted point in the input.
+    codes : (count,) uint64
+        Morton codes, `bits` an axis, ascending.
+    sorted : DeviceArray (6, padded) float32
+        x, y, z, normal x, y, z.
+    boxes, node_offset : DeviceArray
+        See kernels/build/point_tree.clh.
+    top_level : int
+    low, scale : float
+        The cell of a coordinate x is floor((x - low) * scale), before clamping.
+    """
+
+    device: Device
+    count: int
+    padded: int
+    order: NDArray
+    codes: NDArray
+    bits: int
+    sorted: DeviceArray
+    boxes: DeviceArray
+    node_offset: DeviceArray
+    top_level: int
+    low: NDArray
+    scale: float
+
+    @property
+    def arguments(self) -> tuple:
+        """The kernel arguments of a ball query: padded, sorted, boxes, node_offset, top_level."""
+        return self.padded, self.sorted, self.boxes, self.node_offset, self.top_level
+
+    def cells(self, width: float) -> tuple[list[NDArray], list[NDArray]]:
+        """Return first and last + 1 point of the occupied cells at least `width` wide, one pair of arrays per colour.
+
+        The colour of a cell is the parity of its three integer coordinates: 8 colours.
+        """
+        finest = 1.0 / self.scale
+        step = max(0, int(np.ceil(np.log2(max(width / finest, 1.0)))))
+        step = min(step, self.bits)
+        cell = self.codes >> np.uint64(3 * step)
+        start = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]])).astype(np.int32)
+        end = np.append(start[1:], np.int32(self.count)).astype(np.int32)
+        color = (cell[start] & np.uint64(7)).astype(np.uint8)
+        groups = [np.flatnonzero(color == c) for c in range(8)]
+        return [start[g] for g in groups if len(g)], [end[g] for g in groups if len(g)]
+
+
+def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: float, device: Device) -> PointTree:
+    """Sort points along the Morton curve of their box and build the tree over them.
+
+    Parameters
+    ----------
+    points, normals : (n, 3) float32
+        n at least 1; normals of any positive length.
+    middle : (3,) float32
+    scale : float
+        Sorted coordinates are (points - middle) * scale.
+    """
+    count = len(points)
+    index_bits = max(1, (count - 1).bit_length())
+    bits = min(16, (64 - index_bits) // 3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    width = max(float((high - low).max()), float(np.finfo(np.float32).tiny))
+    code_scale = (1 << bits) / (width * (1 + 1e-6))
+    on_device = device.upload(points)
+    codes = device.empty(count, np.uint64)
+    kernel = device.kernel("build/morton_codes.cl", constants={"BITS": bits, "INDEX_BITS": index_bits})
+    kernel((count,), (64,), count, on_device, *map(float, low), code_scale, codes)
+    packed = np.sort(device.download(codes, copy=False))
+    order = (packed & np.uint64((1 << index_bits) - 1)).astype(np.int32)
+    packed >>= np.uint64(index_bits)
+    padded = -(-count // BLOCK) * BLOCK
+    out = device.empty((6, padded), np.float32)
+    device.kernel("build/gather_points.cl")((padded,), (64,), count, padded, on_device, device.upload(normals),
+                                           device.upload(order), *map(float, middle), float(scale), out)
+    boxes, node_offset, top_level = build_boxes(out, padded, device)
+    return PointTree(device, count, padded, order, packed, bits, out, boxes, node_offset, top_level,
+                     (low - middle) * scale, code_scale / scale)
+
+
+def build_boxes(coordinates: DeviceArray, padded: int, device: Device) -> tuple[DeviceArray, DeviceArray, int]:
+    """Return records, offsets and top level of the 16-wide tree over blocks of 16 points (point_tree.clh)."""
+    nodes = [padded // BLOCK]  # level 0: blocks
+    while nodes[-1] > 1 or len(nodes) == 1:
+        nodes.append(-(-nodes[-1] // BLOCK))
+    offset = np.concatenate([[0, 0], np.cumsum(nodes[1:])]).astype(np.int32)  # level 0 has no records
+    boxes = device.empty((int(offset[-1]), 6, BLOCK), np.float32)
+    device.kernel("build/block_boxes.cl")((nodes[1],), (1,), nodes[1], nodes[0], padded, coordinates, boxes)
+    for level in range(2, len(nodes)):
+        device.kernel("build/node_boxes.cl")((nodes[level],), (1,), nodes[level], nodes[level - 1], int(offset[level]),
+                                             int(offset[level - 1]), boxes)
+    return boxes, device.upload(offset), len(nodes) - 1

@@ -1,0 +1,21 @@
+// The lowest records of the point tree: boxes of blocks of 16 points (see point_tree.clh).
+#define EMPTY 1e30f
+
+__kernel void block_boxes(int nodes, int blocks, int padded, __global const float *sorted, __global float *boxes) {
+  int node = get_global_id(0);
+  if (node >= nodes) return;
+  for (int axis = 0; axis < 3; ++axis)
+    for (int j = 0; j < 16; ++j) {
+      int block = 16 * node + j;
+      float low = EMPTY, high = -EMPTY;
+      if (block < blocks) {
+        __global const float *p = sorted + (size_t)axis * padded + 16 * (size_t)block;
+        for (int k = 0; k < 16; ++k) {
+          low = p[k] < low ? p[k] : low;
+          high = p[k] > high ? p[k] : high;
+        }
+      }
+      boxes[96 * (size_t)node + 16 * axis + j] = low;
+      boxes[96 * (size_t)node + 16 * (axis + 3) + j] = high;
+    }
+}
