@@ -1,0 +1,62 @@
+"""Benchmarks: each job checks its answer, then prints figures with the device, driver, commit and scene beside them.
+
+`clsurf bench build|tiles|normals [--json FILE]`, `clsurf bench compare A B`; `python -m bench.report FILE` runs all.
+"""
+
+import importlib
+
+JOBS = {
+    "build": "scan to SLIM surface: time, size, error, overlap, memory",
+    "tiles": "frames: time, time per stage and tile, holes, silhouettes, depth and normals against ray casting",
+    "normals": "neighbours, normals and their orientation",
+}
+
+
+def run(job: str, device=None, json_path=None, quick: bool = False, profile: bool = False) -> dict:
+    """Run the job `job`, print its figures and return them.
+
+    Parameters
+    ----------
+    job : str
+        One of `JOBS`.
+    device : optional
+        As everywhere in clsurf.
+    json_path : path, optional
+        Write the figures there.
+    quick : bool
+        A small generated scan, a few seconds.
+    profile : bool
+        Print the time of every kernel too.
+
+    Returns
+    -------
+    dict
+        ``job``, ``record`` (where the figures come from), ``figures``.
+
+    Raises
+    ------
+    InputError
+        An unknown job, or a file that cannot be written.
+    """
+    from clsurf.device import open_device
+    from clsurf.errors import InputError
+
+    from . import record
+    if job not in JOBS:
+        raise InputError(f"bench job: expected {', '.join(JOBS)} or compare, got {job!r}")
+    opened = open_device(device)
+    made = record.provenance(opened)
+    print(f"{job}: {opened.name} ({opened.platform_name}, driver {opened.driver}), {made['cpu']}, commit "
+          f"{made['commit']}")
+    figures = importlib.import_module(f".{job}", __name__).measure(opened, quick=quick, profile=profile)
+    result = {"job": job, "record": made, "figures": figures}
+    if json_path is not None:
+        record.write(json_path, result)
+        print(f"figures: {json_path}")
+    return result
+
+
+def compare_files(before, after) -> list[dict]:
+    """Print the ratios of two JSON files of figures and return them; see `compare`."""
+    from .compare import compare_files
+    return compare_files(before, after)
