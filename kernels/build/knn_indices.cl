@@ -1,0 +1,80 @@
+// Indices and distances of the K nearest points of every query, nearest first.
+//
+// As pass 1 of knn_covariance, with every distance carrying its point along. Points at equal distance come in the order
+// of the tree, so that the result is the same each time.
+#include "build/knn_search.clh"
+
+#ifndef K
+#define K 16
+#endif
+#define CHUNKS ((K + 15) / 16)
+
+#define EXCHANGE_PAIR(da, ia, db, ib) { \
+    VI later = (da > db) | ((da == db) & (ia > ib)); \
+    VF d_ = SEL(da, db, later); db = SEL(db, da, later); da = d_; \
+    VI i_ = SEL(ia, ib, later); ib = SEL(ib, ia, later); ia = i_; \
+  }
+
+// Merge the points of one leaf into the K nearest.
+inline void consider(__global const float *leaf, int number, Queries *q, VF best[16 * CHUNKS], VI index[16 * CHUNKS]) {
+  VF d[16];
+  VI n[16];
+  for (int j = 0; j < 16; j++) {
+    VF x = q->x - leaf[j], y = q->y - leaf[16 + j], z = q->z - leaf[32 + j];
+    d[j] = x * x + y * y + z * z, n[j] = 16 * number + j;
+  }
+#define EXCHANGE(i, j) EXCHANGE_PAIR(d[i], n[i], d[j], n[j])
+  SORT_16(EXCHANGE)
+  for (int c = 0; c < CHUNKS; c++) {
+    VF *b = best + 16 * c;
+    VI *m = index + 16 * c;
+    for (int i = 0; i < 16; i++) EXCHANGE_PAIR(b[i], m[i], d[15 - i], n[15 - i])
+#define EXCHANGE_BEST(i, j) EXCHANGE_PAIR(b[i], m[i], b[j], m[j])
+    MERGE_16(EXCHANGE_BEST)
+    MERGE_16(EXCHANGE)
+  }
+}
+
+__kernel void knn_indices(__global const VF *nodes, __global const float *leaves,
+                          __global const uint *order,        // (count,) indices of the points along the curve
+                          __global const float *queries,     // (blocks, 3, 16)
+                          __global const uint *query_order,  // (query_count,) where results go
+                          __global const uint *starts,       // (blocks,) a leaf near each block of queries
+                          __global int *indices,             // (query_count, K), -1 for none
+                          __global float *distances,         // (query_count, K), INFINITY for none
+                          uint count, uint query_count, int first_leaf, int leaf_count, float unit)
+{
+  uint first = get_global_id(0) * VW;
+  if (first >= query_count) return;
+  Queries q = load_queries(queries, first, query_count);
+
+  VF best[16 * CHUNKS];
+  VI index[16 * CHUNKS];
+  for (int i = 0; i < 16 * CHUNKS; i++) best[i] = FAR, index[i] = 0x7fffffff;
+  int start = starts[first / 16];
+  int low = start > 0 ? start - 1 : 0, high = start + 1 < leaf_count ? start + 1 : start;
+  for (int leaf = low; leaf <= high; leaf++) consider(leaves + 48 * leaf, leaf, &q, best, index);
+  Walk walk;
+  walk.top = 1, walk.stack[0] = 0;
+  do {
+    int noted = near_leaves(nodes, first_leaf, &q, largest_lane(best[K - 1]), &walk);
+    for (int i = 0; i < noted; i++) {
+      int leaf = walk.list[i];
+      if (leaf >= low && leaf <= high) continue;
+      if (any_lane(gap_to_leaf((__global const float *)nodes, first_leaf, leaf, &q) < best[K - 1]))
+        consider(leaves + 48 * leaf, leaf, &q, best, index);
+    }
+  } while (walk.top > 0);
+
+  for (int i = 0; i < K; i++) {
+    union { VF v; float s[VW]; } d;
+    union { VI v; int s[VW]; } n;
+    d.v = VSQRT(best[i]) * unit, n.v = index[i];
+    for (uint j = 0; j < VW && first + j < query_count; j++) {
+      uint at = query_order[first + j] * K + i;
+      int found = (uint)n.s[j] < count;
+      indices[at] = found ? (int)order[n.s[j]] : -1;
+      distances[at] = found ? d.s[j] : INFINITY;
+    }
+  }
+}
