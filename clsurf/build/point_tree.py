@@ -28,8 +28,8 @@ class PointTree:
     boxes, node_offset : DeviceArray
         See kernels/build/point_tree.clh.
     top_level : int
-    low, scale : float
-        The cell of a coordinate x is floor((x - low) * scale), before clamping.
+    scale : float
+        Cells of the finest Morton grid per unit length.
     """
 
     device: Device
@@ -42,7 +42,6 @@ class PointTree:
     boxes: DeviceArray
     node_offset: DeviceArray
     top_level: int
-    low: NDArray
     scale: float
 
     @property
@@ -78,35 +77,57 @@ def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: 
         Sorted coordinates are (points - middle) * scale.
     """
     count = len(points)
+    order, codes, grid = morton_order(points, device)
+    padded = -(-count // BLOCK) * BLOCK
+    out = device.empty((6, padded), np.float32)
+    device.kernel("build/gather_points.cl")((padded,), (64,), count, padded, device.upload(points),
+                                           device.upload(normals), device.upload(order), *map(float, middle),
+                                           float(scale), out)
+    boxes, node_offset, top_level = build_boxes(out, padded, device)
+    return PointTree(device, count, padded, order, codes, grid[0], out, boxes, node_offset, top_level,
+                     grid[1] / scale)
+
+
+def morton_order(points: NDArray, device: Device) -> tuple[NDArray, NDArray, tuple[int, float]]:
+    """Sort points (n, 3) float32 along the Morton curve of their box.
+
+    Returns
+    -------
+    order : (n,) int32
+    codes : (n,) uint64
+        In that order.
+    grid : tuple
+        Bits an axis, and the number of cells per length.
+    """
+    count = len(points)
     index_bits = max(1, (count - 1).bit_length())
     bits = min(16, (64 - index_bits) // 3)
     low, high = points.min(axis=0), points.max(axis=0)
     width = max(float((high - low).max()), float(np.finfo(np.float32).tiny))
-    code_scale = (1 << bits) / (width * (1 + 1e-6))
-    on_device = device.upload(points)
+    cells_per_length = (1 << bits) / (width * (1 + 1e-6))
     codes = device.empty(count, np.uint64)
     kernel = device.kernel("build/morton_codes.cl", constants={"BITS": bits, "INDEX_BITS": index_bits})
-    kernel((count,), (64,), count, on_device, *map(float, low), code_scale, codes)
-    packed = np.sort(device.download(codes, copy=False))
-    order = (packed & np.uint64((1 << index_bits) - 1)).astype(np.int32)
-    packed >>= np.uint64(index_bits)
-    padded = -(-count // BLOCK) * BLOCK
-    out = device.empty((6, padded), np.float32)
-    device.kernel("build/gather_points.cl")((padded,), (64,), count, padded, on_device, device.upload(normals),
-                                           device.upload(order), *map(float, middle), float(scale), out)
-    boxes, node_offset, top_level = build_boxes(out, padded, device)
-    return PointTree(device, count, padded, order, packed, bits, out, boxes, node_offset, top_level,
-                     (low - middle) * scale, code_scale / scale)
+    kernel((count,), (64,), count, device.upload(points), *map(float, low), cells_per_length, codes)
+    # The index below each code makes all keys different, so that a plain sort of the keys gives the order.
+    codes = np.sort(device.download(codes, copy=False))
+    order = (codes & np.uint64((1 << index_bits) - 1)).astype(np.int32)
+    codes >>= np.uint64(index_bits)
+    return order, codes, (bits, cells_per_length)
 
 
-def build_boxes(coordinates: DeviceArray, padded: int, device: Device) -> tuple[DeviceArray, DeviceArray, int]:
-    """Return records, offsets and top level of the 16-wide tree over blocks of 16 points (point_tree.clh)."""
+def build_boxes(coordinates: DeviceArray, padded: int, device: Device, radius: DeviceArray | None = None
+                ) -> tuple[DeviceArray, DeviceArray, int]:
+    """Return records, offsets and top level of the 16-wide tree over blocks of 16 points (point_tree.clh).
+
+    With `radius` (padded,) the boxes are those of balls.
+    """
     nodes = [padded // BLOCK]  # level 0: blocks
     while nodes[-1] > 1 or len(nodes) == 1:
         nodes.append(-(-nodes[-1] // BLOCK))
     offset = np.concatenate([[0, 0], np.cumsum(nodes[1:])]).astype(np.int32)  # level 0 has no records
     boxes = device.empty((int(offset[-1]), 6, BLOCK), np.float32)
-    device.kernel("build/block_boxes.cl")((nodes[1],), (1,), nodes[1], nodes[0], padded, coordinates, boxes)
+    device.kernel("build/block_boxes.cl")((nodes[1],), (1,), nodes[1], nodes[0], padded, coordinates,
+                                              coordinates if radius is None else radius, int(radius is not None), boxes)
     for level in range(2, len(nodes)):
         device.kernel("build/node_boxes.cl")((nodes[level],), (1,), nodes[level], nodes[level - 1], int(offset[level]),
                                              int(offset[level - 1]), boxes)
