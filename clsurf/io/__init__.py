@@ -1,0 +1,1 @@
+"""Files: scans, surfaces and pictures in and out."""

@@ -1,0 +1,248 @@
+"""OBJ, STL, OFF, GLB and glTF: read through trimesh, and written."""
+
+import contextlib
+import json
+import logging
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from clsurf.errors import FileFormatError
+from clsurf.surface.cloud import PointCloud
+from clsurf.surface.mesh import Mesh
+
+from .colors import as_rgba8
+from .images import read_image, write_image
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+_NO_PICTURE = (2, 2)  # what trimesh puts where a material names no picture
+_BLOCK = 65536  # rows of text formatted at once
+
+
+def read_mesh(path: Path) -> Mesh | PointCloud:
+    """Read a mesh with its vertices unmerged and in order; a scene's parts are placed and put together.
+
+    A vertex of an OBJ file with several texture coordinates becomes one vertex for each (a seam). Where an OBJ file has
+    coordinates but names no picture, a picture of the same name beside it is taken.
+
+    Raises
+    ------
+    FileFormatError
+        Damaged, without vertices, or compressed with Draco while DracoPy is not installed.
+    """
+    ending = path.suffix.lower()
+    if ending == ".stl":
+        _check_stl(path)
+    if ending in (".glb", ".gltf"):
+        _check_draco(path)
+    options = {}
+    if ending == ".obj":
+        data = path.read_bytes()
+        # Without texture coordinates every vertex stays as it is; with them vertices are split along seams.
+        options["maintain_order"] = b"\nvt" not in data
+    with _quiet():
+        loaded = trimesh.load(str(path), process=False, **options)
+    parts = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
+    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if len(meshes) > 1:
+        meshes = [trimesh.util.concatenate(meshes)]
+    if meshes:
+        return _mesh_of(meshes[0], path)
+    clouds = [part for part in parts if len(getattr(part, "vertices", ())) and part.vertices.shape[1] == 3]
+    if not clouds:
+        raise FileFormatError(f"{path}: holds no vertices")
+    points = np.concatenate([np.asarray(part.vertices, np.float64) for part in clouds])
+    colors = [np.asarray(getattr(part, "colors", ())) for part in clouds]
+    whole = all(c.ndim == 2 and len(c) == len(p.vertices) for c, p in zip(colors, clouds, strict=True))
+    return PointCloud(points, colors=as_rgba8(np.concatenate(colors)) if whole else None)
+
+
+def _mesh_of(part: trimesh.Trimesh, path: Path) -> Mesh:
+    count = len(part.vertices)
+    points = np.asarray(part.vertices, np.float64)
+    if path.suffix.lower() == ".stl" and np.abs(points).max(initial=0) < 3e38:
+        points = points.astype(np.float32)
+    faces = np.asarray(part.faces)
+    if faces.min() < 0 or faces.max() >= count:
+        raise FileFormatError(f"{path}: face index outside the {count:,} vertices: damaged file")
+    normals = None
+    if "vertex_normals" in part._cache.cache:  # given in the file; the property would compute them
+        normals = np.asarray(part._cache.cache["vertex_normals"], np.float32)
+        normals = normals if normals.shape == (count, 3) else None
+    colors = uv = texture = None
+    visual = part.visual
+    if visual.kind == "vertex":
+        colors = as_rgba8(visual.vertex_colors)
+    elif visual.kind == "face":
+        colors = as_rgba8(visual.to_vertex_colors().vertex_colors if hasattr(visual, "to_vertex_colors")
+                          else trimesh.visual.color.face_to_vertex_color(part, visual.face_colors))
+    elif visual.kind == "texture" and np.shape(getattr(visual, "uv", None)) == (count, 2):
+        uv = np.asarray(visual.uv, np.float32)
+        texture = _texture_of(visual.material, path)
+    return Mesh(points, faces, normals, colors, uv, texture)
+
+
+def _texture_of(material, path: Path) -> NDArray | None:
+    """Return the picture (h, w, 4) uint8 of a material, or the one beside an OBJ file, or None."""
+    picture = getattr(material, "baseColorTexture", None)
+    picture = getattr(material, "image", None) if picture is None else picture
+    if picture is not None and picture.size != _NO_PICTURE:
+        return np.array(picture.convert("RGBA"))
+    if path.suffix.lower() == ".obj":
+        for ending in _PICTURES:
+            beside = path.with_suffix(ending)
+            if beside.is_file():
+                pixels = read_image(beside)
+                pixels = (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
+                pixels = pixels[..., [0, 0, 0]] if pixels.shape[2] < 3 else pixels
+                return as_rgba8(pixels.reshape(-1, pixels.shape[2])[:, :4]).reshape(*pixels.shape[:2], 4)
+    return None
+
+
+def _check_stl(path: Path) -> None:
+    """Refuse a binary STL file that is shorter or longer than its count of triangles says."""
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        head = file.read(512)
+    if head.lstrip()[:5].lower() == b"solid" and b"facet" in head:
+        return
+    count = struct.unpack("<I", head[80:84])[0] if len(head) >= 84 else 0
+    if size < 84 + 50 * count or not count:
+        raise FileFormatError(f"{path}: truncated or not an STL file: {count:,} triangles do not fit in {size:,} bytes")
+
+
+def _check_draco(path: Path) -> None:
+    """Refuse Draco-compressed glTF without its decoder: trimesh would give zeros."""
+    with open(path, "rb") as file:
+        head = file.read(20)
+        if head[:4] == b"glTF":
+            length = struct.unpack("<I", head[12:16])[0]
+            if length > path.stat().st_size:
+                raise FileFormatError(f"{path}: truncated: its description is {length:,} bytes long")
+            tree = json.loads(file.read(length))
+        else:
+            tree = json.loads(head + file.read())
+    if "KHR_draco_mesh_compression" in tree.get("extensionsRequired", ()):
+        try:
+            import DracoPy  # noqa: F401
+        except ImportError:
+            raise FileFormatError(f"{path}: compressed with Draco, whose decoder is missing: "
+                                  "pip install DracoPy") from None
+
+
+@contextlib.contextmanager
+def _quiet():
+    """Hold back trimesh's own log lines: what matters of them is raised or logged here."""
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def write_mesh(scan: Mesh | PointCloud, path: Path) -> None:
+    """Write .obj, .stl, .off or .glb at `path`, a temporary name that ends up as the stem of the real one."""
+    {".obj": _write_obj, ".stl": _write_stl, ".off": _write_off, ".glb": _write_glb}[path.suffix.lower()](scan, path)
+
+
+def _faces(scan) -> NDArray:
+    return getattr(scan, "faces", np.zeros((0, 3), np.int32))
+
+
+def _write_stl(scan: Mesh, path: Path) -> None:
+    corners = (scan.vertices + scan.origin).astype(np.float32)[scan.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    rows = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    rows["normal"] = normals / np.where(length > 0, length, 1)
+    rows["corners"] = corners
+    with open(path, "wb") as file:
+        file.write(b"clsurf".ljust(80, b" ") + struct.pack("<I", len(rows)))
+        rows.tofile(file)
+
+
+def _write_off(scan, path: Path) -> None:
+    faces, colors = _faces(scan), scan.colors
+    with open(path, "w", encoding="ascii", newline="\n") as file:
+        file.write(f"{'OFF' if colors is None else 'COFF'}\n{len(scan.points)} {len(faces)} 0\n")
+        _write_rows(file, [(_world(scan), _digits(scan))] + ([] if colors is None else [(colors, "%d")]))
+        _write_rows(file, [(faces, "%d")], "3 ")
+
+
+def _write_obj(scan, path: Path) -> None:
+    """Write OBJ; colours follow the positions (a common extension), a texture goes to NAME.mtl and NAME.png."""
+    faces, uv = _faces(scan), getattr(scan, "uv", None)
+    texture = getattr(scan, "texture", None)
+    with open(path, "w", encoding="utf-8", newline="\n") as file:
+        file.write("# clsurf\n")
+        if texture is not None and uv is not None:
+            stem = _final_stem(path)
+            file.write(f"mtllib {stem}.mtl\nusemtl {stem}\n")
+            picture, material = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.mtl")
+            write_image(picture, texture)
+            beside = path.with_suffix(".mtl")
+            beside.write_text(f"newmtl {stem}\nKa 1 1 1\nKd 1 1 1\nmap_Kd {stem}.png\n", encoding="utf-8")
+            os.replace(beside, material)
+        colors = [] if scan.colors is None else [(scan.colors[:, :3] / 255, "%.6f")]
+        _write_rows(file, [(_world(scan), _digits(scan)), *colors], "v ")
+        if uv is not None:
+            _write_rows(file, [(uv, "%.9g")], "vt ")
+        if scan.normals is not None:
+            _write_rows(file, [(scan.normals, "%.9g")], "vn ")
+        corner = {(False, False): "%d", (True, False): "%d/%d", (False, True): "%d//%d",
+                  (True, True): "%d/%d/%d"}[uv is not None, scan.normals is not None]
+        repeat = corner.count("%d")
+        line = "f " + " ".join([corner] * 3) + "\n"
+        for at in range(0, len(faces), _BLOCK):
+            block = np.repeat(faces[at:at + _BLOCK] + 1, repeat, axis=1)
+            file.write((line * len(block)) % tuple(block.ravel().tolist()))
+
+
+def _write_glb(scan, path: Path) -> None:
+    """Write GLB; the float64 origin is the translation of its node."""
+    faces = _faces(scan)
+    if len(faces):
+        part = trimesh.Trimesh(scan.points, faces, vertex_normals=scan.normals, process=False)
+        if getattr(scan, "uv", None) is not None and scan.texture is not None:
+            from PIL import Image
+            material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(scan.texture),
+                                                           metallicFactor=0.0, roughnessFactor=1.0)
+            part.visual = trimesh.visual.TextureVisuals(uv=scan.uv, material=material)
+        elif scan.colors is not None:
+            part.visual = trimesh.visual.ColorVisuals(part, vertex_colors=scan.colors)
+    else:
+        part = trimesh.PointCloud(scan.points, colors=scan.colors)
+    scene = trimesh.Scene()
+    placement = np.eye(4)
+    placement[:3, 3] = scan.origin
+    scene.add_geometry(part, transform=placement)
+    with _quiet():
+        data = scene.export(file_type="glb", include_normals=scan.normals is not None)
+    path.write_bytes(data)
+
+
+def _final_stem(path: Path) -> str:
+    """Return the stem of the file that `replacing` made the temporary name `path` for: .STEM.RANDOM.ending."""
+    return path.stem[1:].rsplit(".", 1)[0] if path.stem.startswith(".") else path.stem
+
+
+def _world(scan) -> NDArray:
+    return scan.points + scan.origin if scan.origin.any() else scan.points
+
+
+def _digits(scan) -> str:
+    return "%.15g" if scan.origin.any() else "%.9g"
+
+
+def _write_rows(file, parts, prefix: str = "") -> None:
+    """Write a line for each row of the arrays in `parts`, pairs of an (n, k) array and a number format."""
+    line = prefix + " ".join(" ".join([form] * array.shape[1]) for array, form in parts) + "\n"
+    for at in range(0, len(parts[0][0]), _BLOCK):
+        rows = np.concatenate([np.asarray(array[at:at + _BLOCK], np.float64) for array, _ in parts], axis=1)
+        file.write((line * len(rows)) % tuple(rows.ravel().tolist()))

@@ -1,0 +1,173 @@
+"""Reading and writing scans: meshes and point clouds in every common format, chosen by the file's ending."""
+
+import logging
+import warnings
+from pathlib import Path
+
+from clsurf.errors import Error, FileFormatError, InputError
+from clsurf.surface.cloud import PointCloud
+from clsurf.surface.mesh import Mesh
+
+from .cleaning import clean_scan
+from .files import existing_file, one_line, replacing
+
+log = logging.getLogger("clsurf")
+
+
+def load_scan(path, clean: bool = True) -> Mesh | PointCloud:
+    """Read a scan.
+
+    PLY, OBJ, STL, OFF, GLB and glTF give a Mesh, or a PointCloud where they hold no faces; XYZ, PTS, CSV, TXT, ASC,
+    NPY, LAS and LAZ (COPC) a PointCloud; NPZ either. Vertices keep their order.
+
+    Parameters
+    ----------
+    path : path-like
+    clean : bool
+        Drop what is not finite, duplicate, unreferenced or has a zero normal, as `clean_scan` does.
+
+    Returns
+    -------
+    Mesh or PointCloud
+        Positions float32 relative to a float64 origin, which is zero for files that hold float32.
+
+    Raises
+    ------
+    InputError
+        No such file, a folder, no permission, or an unknown ending.
+    FileFormatError
+        An empty, truncated, damaged or foreign file, or one without points.
+    """
+    reader = _format_of(path, "read")
+    path = existing_file(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the libraries about the damage that is reported below
+            scan = reader(path)
+    except Error:
+        raise
+    except MemoryError:
+        raise FileFormatError(f"{path}: too large for this machine's memory, or a damaged header") from None
+    except Exception as error:  # the libraries raise anything for a damaged file
+        raise FileFormatError(f"{path}: damaged or not a {path.suffix} file: {one_line(error)}") from error
+    if not len(scan.points):
+        raise FileFormatError(f"{path}: holds no points")
+    if clean:
+        scan = clean_scan(scan, path.name)
+        if not len(scan.points):
+            raise FileFormatError(f"{path}: holds no finite points")
+    return scan
+
+
+def save_scan(scan: Mesh | PointCloud, path) -> None:
+    """Write a scan in the format of `path`'s ending; the file appears whole or not at all.
+
+    World positions are written. What a format cannot hold (colours in STL, say) is left out and named in one log line;
+    STL is float32, so a survey coordinate loses millimetres there. OBJ with a texture also writes NAME.mtl and
+    NAME.png.
+
+    Parameters
+    ----------
+    scan : Mesh or PointCloud
+    path : path-like
+        .ply .obj .stl .off .glb .xyz .txt .asc .pts .csv .npy .npz .las .laz
+
+    Raises
+    ------
+    InputError
+        An unknown ending, a cloud for a format of meshes, or a place that cannot be written.
+    """
+    writer = _format_of(path, "write")
+    if not isinstance(scan, Mesh | PointCloud):
+        raise InputError(f"scan: expected a Mesh or PointCloud, got {type(scan).__name__}")
+    ending = Path(path).suffix.lower()
+    if ending == ".stl" and not (isinstance(scan, Mesh) and len(scan.faces)):
+        raise InputError(f"{path}: .stl holds triangles, got points only: write .ply, .xyz or .laz")
+    lost = [name for name in ("faces", "normals", "colors", "uv", "texture", "scanners", "attributes")
+            if name not in _HOLDS[ending] and _has(scan, name)]
+    with replacing(path) as temporary:
+        writer(scan, temporary)
+    if lost:
+        log.info("%s: %s cannot hold %s", Path(path).name, ending, ", ".join(lost))
+
+
+def _has(scan, name: str) -> bool:
+    value = getattr(scan, name, None)
+    return value is not None and len(value) > 0
+
+
+def _read_ply(path):
+    from .ply import read_ply
+    return read_ply(path)
+
+
+def _read_text(path):
+    from .columns import read_text
+    return read_text(path)
+
+
+def _read_las(path):
+    from .las import read_las
+    return read_las(path)
+
+
+def _read_mesh(path):
+    from .meshes import read_mesh
+    return read_mesh(path)
+
+
+def _read_arrays(path):
+    from .numpy_files import read_numpy
+    return read_numpy(path)
+
+
+def _write_ply(scan, path):
+    from .ply import write_ply
+    write_ply(scan, path)
+
+
+def _write_text(scan, path):
+    from .columns import write_text
+    write_text(scan, path)
+
+
+def _write_las(scan, path):
+    from .las import write_las
+    write_las(scan, path)
+
+
+def _write_mesh(scan, path):
+    from .meshes import write_mesh
+    write_mesh(scan, path)
+
+
+def _write_arrays(scan, path):
+    from .numpy_files import write_numpy
+    write_numpy(scan, path)
+
+
+# The modules are imported by the format that needs them: laspy and trimesh take 0.3 s each.
+_MESH, _TEXT, _LAS = (_read_mesh, _write_mesh), (_read_text, _write_text), (_read_las, _write_las)
+_FORMATS = {".ply": (_read_ply, _write_ply), ".obj": _MESH, ".stl": _MESH, ".off": _MESH, ".glb": _MESH,
+            ".gltf": (_read_mesh, None), ".xyz": _TEXT, ".txt": _TEXT, ".asc": _TEXT, ".pts": _TEXT, ".csv": _TEXT,
+            ".npy": (_read_arrays, _write_arrays), ".npz": (_read_arrays, _write_arrays), ".las": _LAS, ".laz": _LAS}
+_HOLDS = {".ply": "faces normals colors uv attributes", ".obj": "faces normals colors uv texture", ".stl": "faces",
+          ".off": "faces colors", ".glb": "faces normals colors uv texture", ".xyz": "normals colors attributes",
+          ".txt": "normals colors attributes", ".asc": "normals colors attributes", ".pts": "colors attributes",
+          ".csv": "normals colors attributes", ".npy": "normals colors",
+          ".npz": "faces normals colors uv texture scanners attributes", ".las": "normals colors attributes",
+          ".laz": "normals colors attributes"}
+
+READS = tuple(_FORMATS)
+WRITES = tuple(ending for ending, (_, writer) in _FORMATS.items() if writer)
+
+
+def _format_of(path, purpose: str):
+    try:
+        ending = Path(path).suffix.lower()
+    except TypeError:
+        raise InputError(f"path: expected a file name, got {type(path).__name__}") from None
+    known = READS if purpose == "read" else WRITES
+    if ending not in known:
+        raise InputError(f"{path}: unknown scan format {ending or '(no ending)'}: expected one of {' '.join(known)}")
+    return _FORMATS[ending][purpose == "write"]
