@@ -1,0 +1,210 @@
+"""The renderer: a list of stages from a scene to a frame."""
+
+import threading
+import weakref
+
+import numpy as np
+
+from ..device import Device, Profile, open_device
+from ..errors import DeviceError, InputError
+from .camera import Camera
+from .frame import Frame
+from .scene import as_scene
+from .shade import CHANNELS, Shading, shade, shading_floats
+from .slim import draw_slim, surfel_colors, upload_slim
+from .tiles import BIN, Grid, Layout, Scratch, view_floats
+
+LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
+
+
+class Renderer:
+    """Draws scenes on one device; keeps uploaded surfaces and buffers between frames. One per thread.
+
+    Parameters
+    ----------
+    device : str, Device, ..., optional
+        See `clsurf.open_device`.
+    lanes : int, optional
+        Kernel form: 16, 8 or 4 vector lanes per work-item, or 1 for a work-group per tile; by default the device's.
+    tile : int, optional
+        Pixels across a tile, a multiple of 8; by default 32 (8 for work-groups).
+    profile : bool
+        Time every launch; see the attribute `profile`.
+
+    Attributes
+    ----------
+    profile : Profile or None
+        Print it for a table of kernels and times.
+    """
+
+    def __init__(self, device=None, lanes: int | None = None, tile: int | None = None, profile: bool = False):
+        self.device: Device = open_device(device)
+        lanes = self.device.lanes if lanes is None else lanes
+        if lanes not in (16, 8, 4, 1):
+            raise InputError(f"lanes: expected 16, 8, 4 or 1, got {lanes}")
+        tile = (BIN if lanes == 1 else 32) if tile is None else tile
+        if tile != int(tile) or tile <= 0 or tile % BIN:
+            raise InputError(f"tile: expected a positive multiple of {BIN} pixels, got {tile}")
+        self.tile_bins = int(tile) // BIN
+        self.profile = Profile() if profile else None
+        self._scratch: Scratch | None = Scratch(self.device, lanes)
+        self._uploads = weakref.WeakKeyDictionary()
+
+    def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
+               channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
+               background=(1.0, 1.0, 1.0, 1.0)) -> Frame:
+        """Draw a scene.
+
+        Parameters
+        ----------
+        scene : Scene, surface, placed surface, or list of those
+        camera : Camera, optional
+            By default one that frames the scene.
+        size : (int, int)
+            Width and height in pixels.
+        channels : sequence of str
+            Of "color", "depth", "normal", "position", "id", "count", "level", "cost" (see `Frame`); "cost" is the
+            number of surfel evaluations per pixel of the pixel's bin of 8x8.
+        shading : Shading, optional
+        lod : float
+            Surfels that appear up to this many pixels wide are drawn in place of the finer ones below them: 4 is safe,
+            8 a fast mode that shows, 0 draws the leaves only.
+        background : 3 or 4 floats
+            sRGB with straight alpha, 0 to 1.
+
+        Returns
+        -------
+        Frame
+
+        Raises
+        ------
+        InputError
+            An option that cannot be used.
+        DeviceError
+            The renderer is closed, or the device lacks memory.
+        """
+        if self._scratch is None:
+            raise DeviceError("renderer: it is closed: make a new Renderer")
+        scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
+        shading = Shading() if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
+        camera = self._framing(scene, size) if camera is None else camera
+        own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
+        try:
+            # The stages of a frame.
+            grid = self._new_grid(scene, size, channels, shading)
+            for number, (surface, matrix) in enumerate(scene.placed):
+                self._draw(grid, number, surface, matrix, camera, lod, shading)
+            origin = scene_origin(scene)
+            arrays = self._shade(grid, camera, origin, scene.lights, shading, background, channels)
+            return Frame({name: self.device.download(array, copy=False) for name, array in arrays.items()}, origin,
+                         camera)
+        finally:
+            self.device.profile = own_profile
+
+    def _framing(self, scene, size) -> Camera:
+        box = scene.bounds
+        if not np.isfinite(box).all():
+            box = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        return Camera.framing(box, aspect=size[0] / size[1])
+
+    def _new_grid(self, scene, size, channels, shading) -> Grid:
+        """Return bins that nothing has touched yet."""
+        colored = shading.model_colors and any(s.colors is not None for s, _ in scene.placed)
+        colored |= shading.look.startswith("ball")
+        layout = Layout(color=colored and "color" in channels, id="id" in channels, count="count" in channels,
+                        level="level" in channels)
+        bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
+        pixels = size[0] * size[1]
+        self.device.check_memory(planes=4 * 64 * fields * bins,
+                                 **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
+        touched = self._scratch.array("touched", (bins,), np.int32)
+        self.device.fill(touched, -1)
+        return Grid(size, self.tile_bins, layout, touched,
+                    self._scratch.array("planes", (bins, fields, 64), np.float32))
+
+    def _draw(self, grid, number, surface, matrix, camera, lod, shading) -> None:
+        upload = self._uploads.get(surface)
+        if upload is None:
+            upload = self._uploads[surface] = upload_slim(self.device, surface)
+        colors = None
+        if grid.layout.color:
+            colors = surfel_colors(self.device, upload, shading)
+        draw_slim(self.device, self._scratch, grid, upload, matrix, camera, lod, number, colors)
+
+    def _shade(self, grid, camera, origin, lights, shading, background, channels):
+        offset = camera.eye - origin
+        view = self.device.upload(view_floats(camera, grid.size, offset=offset))
+        lamps = self.device.upload(shading_floats(shading, lights, background, camera))
+        return shade(self.device, self._scratch, grid, view, lamps, shading.look != "flat", channels)
+
+    def close(self) -> None:
+        """Give all device memory back; the renderer cannot be used afterwards. May be called twice."""
+        if self._scratch is not None:
+            self._scratch.clear()
+            self._scratch = None
+            self._uploads.clear()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+
+def scene_origin(scene) -> np.ndarray:
+    """Return the world position (3,) float64 that the channel "position" is relative to: the first surface's zero."""
+    if not scene.surfaces:
+        return np.zeros(3)
+    surface, matrix = scene.placed[0]
+    return surface.origin.copy() if matrix is None else matrix[:3, :3] @ surface.origin + matrix[:3, 3]
+
+
+def checked_size(size) -> tuple[int, int]:
+    """Return (width, height) as ints, or raise InputError."""
+    try:
+        width, height = (int(v) for v in size)
+        whole = (width, height) == tuple(size)
+    except (TypeError, ValueError):
+        whole = False
+    if not whole or not (1 <= width <= LARGEST_SIZE and 1 <= height <= LARGEST_SIZE):
+        raise InputError(f"size: expected (width, height) in pixels from 1 to {LARGEST_SIZE}, got {size}")
+    return width, height
+
+
+def checked_channels(channels) -> tuple[str, ...]:
+    """Return the channels' names, or raise InputError."""
+    channels = (channels,) if isinstance(channels, str) else tuple(dict.fromkeys(channels))
+    unknown = [name for name in channels if name not in CHANNELS]
+    if unknown or not channels:
+        raise InputError(f"channels: expected some of {', '.join(CHANNELS)}, got {', '.join(map(str, channels)) or 'none'}")
+    return channels
+
+
+def checked_lod(lod) -> float:
+    """Return the level-of-detail threshold in pixels, or raise InputError."""
+    if not np.isscalar(lod) or not 0 <= lod < np.inf:
+        raise InputError(f"lod: expected a projected diameter in pixels of at least 0, got {lod}")
+    return float(lod)
+
+
+def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768), channels=("color", "depth", "normal"),
+           shading: Shading | None = None, lod: float = 4.0, background=(1.0, 1.0, 1.0, 1.0), device=None,
+           tile: int | None = None) -> Frame:
+    """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
+
+    Uploads are kept while their surface lives.
+    """
+    return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background)
+
+
+_shared = threading.local()
+
+
+def shared_renderer(device=None, tile: int | None = None) -> Renderer:
+    """Return this thread's renderer for `device` and `tile`, made on first use."""
+    opened = open_device(device)
+    kept = _shared.__dict__.setdefault("renderers", {})
+    key = (id(opened), tile)
+    if key not in kept:
+        kept[key] = Renderer(opened, tile=tile)
+    return kept[key]

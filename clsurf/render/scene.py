@@ -1,0 +1,64 @@
+"""Scenes: several surfaces and their lights in one picture."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..surface.placed import Placed
+from ..surface.slim import SlimSurface
+from .shade import Light
+
+DRAWABLE = (SlimSurface,)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Surfaces that meet in one z-buffer.
+
+    Parameters
+    ----------
+    surfaces : list of surfaces or placed surfaces
+        Place a surface with ``surface.moved(matrix)``. The number in the list is the channel "id".
+    lights : list of Light, optional
+        By default one headlight.
+
+    Raises
+    ------
+    InputError
+        Something that cannot be drawn.
+    """
+
+    surfaces: tuple
+    lights: tuple[Light, ...] = (Light(),)
+
+    def __post_init__(self):
+        object.__setattr__(self, "surfaces", tuple(self.surfaces))
+        object.__setattr__(self, "lights", tuple(self.lights))
+        for i, surface in enumerate(self.surfaces):
+            own = surface.surface if isinstance(surface, Placed) else surface
+            if not isinstance(own, DRAWABLE):
+                raise InputError(f"scene: surface {i} is a {type(own).__name__}, expected one of "
+                                 f"{', '.join(kind.__name__ for kind in DRAWABLE)}, plain or placed: build a surface "
+                                 "from a scan first (clsurf.build_slim)")
+
+    @property
+    def placed(self) -> list[tuple[object, NDArray | None]]:
+        """(surface, matrix model to world or None) of each surface."""
+        return [(s.surface, s.matrix) if isinstance(s, Placed) else (s, None) for s in self.surfaces]
+
+    @property
+    def bounds(self) -> NDArray:
+        """Bounding box (2, 3) float64 in world space; NaN where there is nothing."""
+        boxes = [b for b in (s.bounds for s in self.surfaces) if np.isfinite(b).all()]
+        if not boxes:
+            return np.full((2, 3), np.nan)
+        return np.stack([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
+
+
+def as_scene(thing) -> Scene:
+    """Return `thing`, a scene, a surface, a placed surface or a list of those, as a scene."""
+    if isinstance(thing, Scene):
+        return thing
+    return Scene(thing if isinstance(thing, list | tuple) else [thing])

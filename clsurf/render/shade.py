@@ -1,0 +1,121 @@
+"""Shading: material, lights, background, and the last stage, which writes the channels of the picture."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..device import Device, DeviceArray
+from ..errors import InputError
+from .tiles import BIN, Grid, Scratch
+
+CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np.float32), "position": (3, np.float32),
+            "id": (0, np.int32), "count": (0, np.int32), "level": (0, np.int32), "cost": (0, np.int32)}
+KINDS = {"headlight": 0, "directional": 1, "point": 2}
+LOOKS = ("phong", "flat", "ball_size", "ball_level")
+SPAN = 128  # pixels of a row of bins that one work-item shades
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light.
+
+    Parameters
+    ----------
+    kind : str
+        "headlight" (at the eye), "directional" or "point".
+    vector : (3,) float
+        Directional: from the surface to the light, world space. Point: its position, world space.
+    color : (3,) float
+        Linear red, green, blue; 1 lights a white surface fully.
+    """
+
+    kind: str = "headlight"
+    vector: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise InputError(f"light kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
+        if np.shape(self.vector) != (3,) or np.shape(self.color) != (3,):
+            raise InputError("light: expected a vector and a color of 3 numbers each")
+
+
+@dataclass(frozen=True)
+class Shading:
+    """How surfaces look.
+
+    Parameters
+    ----------
+    look : str
+        "phong"; "flat": colours without light; "ball_size", "ball_level": the surfels' balls coloured by size or by
+        level (paper, figures 1 and 7).
+    color : (3,) float
+        sRGB colour, 0 to 1, of surfaces that have none.
+    ambient, diffuse, specular : float
+    shininess : int
+        Exponent of the highlight (Blinn-Phong).
+    model_colors : bool
+        Use the colours that a surface carries.
+    """
+
+    look: str = "phong"
+    color: tuple[float, float, float] = (0.80, 0.78, 0.74)
+    ambient: float = 0.12
+    diffuse: float = 0.85
+    specular: float = 0.15
+    shininess: int = 40
+    model_colors: bool = True
+
+    def __post_init__(self):
+        if self.look not in LOOKS:
+            raise InputError(f"shading look: expected one of {', '.join(LOOKS)}, got {self.look!r}")
+        if self.shininess != int(self.shininess) or not 0 <= self.shininess <= 4096:
+            raise InputError(f"shading shininess: expected a whole number from 0 to 4096, got {self.shininess}")
+
+
+def to_linear(srgb):
+    """Return linear light of sRGB values in 0 to 1."""
+    srgb = np.asarray(srgb, np.float64)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
+    """Return the shading buffer of kernels/render/shade.cl; positions and directions in view space.
+
+    `background` is sRGB with straight alpha, 3 or 4 values from 0 to 1.
+    """
+    back = np.asarray(background, np.float64)
+    if back.shape not in ((3,), (4,)) or not np.isfinite(back).all():
+        raise InputError(f"background: expected 3 or 4 numbers from 0 to 1 (sRGB, alpha), got {background}")
+    alpha = back[3] if len(back) == 4 else 1.0
+    out = np.zeros(16 + 8 * len(lights), np.float32)
+    out[0:3] = to_linear(shading.color)
+    out[3:7] = shading.ambient, shading.diffuse, shading.specular, shading.shininess
+    out[8:11], out[11] = to_linear(back[:3]) * alpha, alpha
+    out[12] = len(lights)
+    for i, light in enumerate(lights):
+        vector = np.asarray(light.vector, np.float64)
+        if light.kind == "directional":
+            vector = camera.rotation @ vector / max(np.linalg.norm(vector), 1e-300)
+        elif light.kind == "point":
+            vector = camera.rotation @ (vector - camera.eye)
+        out[16 + 8 * i:24 + 8 * i] = KINDS[light.kind], *vector, *light.color, 0
+    return out
+
+
+def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps: DeviceArray, lit: bool,
+          channels) -> dict[str, DeviceArray]:
+    """Write the channels of the picture from the grid's planes; return them by name, on the device."""
+    width, height = grid.size
+    out = {}
+    for name in channels:
+        parts, dtype = CHANNELS[name]
+        out[name] = device.empty((height, width, parts) if parts else (height, width), dtype)
+    constants = grid.layout.constants | {"VW": scratch.lanes, "LIT": lit, "SPAN": SPAN}
+    constants |= {f"WRITE_{name.upper()}": name in out for name in ("color", "depth", "normal", "position", "cost")}
+    items = (width, height) if scratch.lanes == 1 else (-(-width // SPAN), -(-height // BIN))
+    unused = scratch.array("unused", (4,), np.float32)
+    device.kernel("render/shade.cl", constants=constants)(
+        items, (8, 8) if scratch.lanes == 1 else (1, 1), view, lamps, grid.planes, grid.touched, grid.bins_x, width,
+        height, *(out.get(name, unused) for name in CHANNELS))
+    return out

@@ -1,0 +1,256 @@
+"""SLIM surfaces in the renderer: upload, level of detail, projection and the tile stage.
+
+Source: Ohtake, Belyaev, Alexa, SGP 2005, section 3. Kernels: kernels/render/*slim.cl.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device, DeviceArray
+from ..errors import InputError
+from ..surface.slim import SlimSurface
+from .shade import Shading, to_linear
+from .tiles import Grid, PairLists, Scratch, bin_pairs, view_floats
+
+RECORD_FLOATS = 32  # kernels/common/slim.clh
+PLANES = 21  # kernels/common/select_slim.clh: 11 + up to 10 coefficients
+COEFFICIENT_PLANE = 11
+IS_LEAF, IS_ROOT = 1, 2
+INTERNAL_SCALE = 1.5  # internal surfels are not alpha-covered: drawn at their own radius they leave holes
+LARGEST_COUNT = 1 << 28
+
+
+@dataclass(frozen=True, eq=False)
+class SlimUpload:
+    """A `SlimSurface` on a device, in planes of `stride` floats (kernels/common/select_slim.clh)."""
+
+    degree: int
+    oriented: bool
+    count: int
+    stride: int
+    planes: DeviceArray  # (PLANES, stride) float32
+    flags: DeviceArray  # (count,) uint8
+    footprint: DeviceArray  # (count, 2) uint32
+    child_offset: DeviceArray
+    children: DeviceArray
+    colors: DeviceArray | None  # (count, 4) float32, linear
+    levels: DeviceArray  # (count,) int32
+    level_end: NDArray  # (levels + 1,) int: surfels of levels[0:i] end at level_end[i]
+    least_internal: NDArray  # (levels,) smallest radius of an internal surfel of each level, inf: none
+    radius_range: tuple[float, float]  # of the leaves; for "ball_size"
+    origin: NDArray  # (3,) float64
+    center: NDArray  # (3,) float64, relative to origin
+    reach: float  # every ball lies within this of `center`
+
+
+@dataclass(frozen=True, eq=False)
+class SlimProjection:
+    """What `project_slim` made for one frame."""
+
+    records: DeviceArray  # (count, 32) float32
+    full: DeviceArray  # (count, 4) int16, blocks of 4x4 pixels
+    core: DeviceArray  # (count, 4) int16
+    keys: DeviceArray  # (count,) uint32
+
+
+def height_bounds(degree: int, k: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return lower and upper bounds of the height polynomial and of its slope over the unit disc.
+
+    Parameters
+    ----------
+    k : (n, 1 | 6 | 10)
+        Coefficients for lengths in units of the radius.
+
+    Returns
+    -------
+    low, high, slope : (n,)
+        `low` and `high` are clipped to the ball, [-1, 1].
+    """
+    k = k.astype(np.float64)
+    low, high, slope = k[:, 0].copy(), k[:, 0].copy(), np.zeros(len(k))
+    if degree >= 2:
+        linear = np.hypot(k[:, 1], k[:, 2])
+        mean, spread = (k[:, 3] + k[:, 5]) / 2, np.hypot((k[:, 3] - k[:, 5]) / 2, k[:, 4] / 2)
+        low += np.minimum(mean - spread, 0) - linear
+        high += np.maximum(mean + spread, 0) + linear
+        slope += linear + 2 * np.maximum(np.abs(mean - spread), np.abs(mean + spread))
+    if degree >= 3:
+        # |u^3| <= 1, |u^2 v| <= 2 / sqrt(27) on the unit circle; the gradient of a cubic form is at most 3 times it.
+        cubic = np.maximum(np.abs(k[:, 6]), np.abs(k[:, 9])) + (np.abs(k[:, 7]) + np.abs(k[:, 8])) * 0.3850
+        low, high, slope = low - cubic, high + cubic, slope + 3 * (np.abs(k[:, 6]) + np.abs(k[:, 9]) + np.abs(k[:, 7])
+                                                                 + np.abs(k[:, 8]))
+    return np.clip(low, -1, 2), np.clip(high, -2, 1), slope
+
+
+def scaled_coefficients(degree: int, coefficients: NDArray, radii: NDArray) -> NDArray:
+    """Return the coefficients (n, 1 | 6 | 10) for lengths in units of `radii`, the one of u v halved."""
+    order = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3][:coefficients.shape[1]])
+    k = coefficients.astype(np.float64) * radii.astype(np.float64)[:, None] ** (order - 1)
+    if degree >= 2:
+        k[:, 4] /= 2
+    return k
+
+
+def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
+    """Put a surface on the device; surfels that are not finite or have no radius are left undrawn.
+
+    Raises
+    ------
+    InputError
+        More surfels than an index holds.
+    DeviceMemoryError
+    """
+    n = len(surface)
+    if n > LARGEST_COUNT:
+        raise InputError(f"surface: expected at most {LARGEST_COUNT:,} surfels to draw, got {n:,}: split it")
+    stride = max(-(-n // 64) * 64, 64)
+    device.check_memory(surfels=4 * PLANES * stride, hierarchy=4 * (n + len(surface.children)), footprints=8 * n,
+                        colors=0 if surface.colors is None else 16 * n)
+    order = np.arange(n)
+    if n and np.any(np.diff(surface.level) < 0):
+        order = np.argsort(surface.level, kind="stable")
+    level, leaf = surface.level[order], surface.leaf[order]
+    child_count = np.diff(surface.child_offset)[order]
+    child_offset = np.concatenate([[0], np.cumsum(child_count)]).astype(np.int32)
+    place = np.empty(n, np.int32)
+    place[order] = np.arange(n, dtype=np.int32)
+    starts = np.repeat(surface.child_offset[:-1][order] - child_offset[:-1], child_count)
+    children = place[surface.children[starts + np.arange(len(starts))]] if len(starts) else np.zeros(1, np.int32)
+
+    size_radius = surface.radii[order].astype(np.float64)
+    radius = size_radius * np.where(leaf, 1.0, INTERNAL_SCALE)
+    normals, centers = surface.normals[order], surface.centers[order]
+    with np.errstate(all="ignore"):
+        k = scaled_coefficients(surface.degree, surface.coefficients[order], radius)
+        full = k.copy()
+        if surface.degree >= 2:
+            full[:, 4] *= 2
+        low, high, slope = height_bounds(surface.degree, full)
+    usable = (np.isfinite(k).all(axis=1) & np.isfinite(centers).all(axis=1) & np.isfinite(normals).all(axis=1)
+              & (radius > 0) & np.isfinite(radius))
+    planes = np.zeros((PLANES, stride), np.float32)
+    for i, values in enumerate([*centers.T, radius, size_radius, *normals.T, low, high, slope, *k.T]):
+        planes[i, :n] = np.where(usable, values, 0)
+    planes[3, :n][~usable] = 1.0
+    planes[5:8, :n][:, ~usable] = np.array([[0], [0], [1]])
+    # low > high: nothing is drawn.
+    planes[8, :n][~usable], planes[9, :n][~usable] = 1.0, -1.0
+    planes[3, n:], planes[7, n:], planes[8, n:], planes[9, n:] = 1.0, 1.0, 1.0, -1.0
+
+    root = np.ones(n, bool)
+    root[children[:len(starts)]] = False
+    footprint = np.full((n, 2), 0xFFFFFFFF, np.uint32)
+    if surface.footprint is not None and n:
+        footprint[leaf] = np.ascontiguousarray(surface.footprint[order]).view("<u4")[leaf]
+    values = np.unique(level)
+    level_end = np.concatenate([[0], np.searchsorted(level, values, side="right")])
+    least = [np.min(size_radius[a:b][~leaf[a:b] & usable[a:b]], initial=np.inf)
+             for a, b in zip(level_end[:-1], level_end[1:], strict=True)]
+    colors = None
+    if surface.colors is not None:
+        colors = np.ones((n, 4), np.float32)
+        colors[:, :3] = to_linear(np.arange(256) / 255)[surface.colors[order, :3]]
+    use = usable if usable.any() else np.zeros(n, bool)
+    points = centers[use].astype(np.float64)
+    center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+    reach = float((np.linalg.norm(points - center, axis=1) + radius[use]).max()) if len(points) else 0.0
+    drawn = size_radius[usable & leaf] if np.any(usable & leaf) else size_radius[usable]
+    return SlimUpload(
+        surface.degree, surface.oriented, n, stride, device.upload(planes),
+        device.upload((IS_LEAF * leaf + IS_ROOT * root).astype(np.uint8)), device.upload(footprint),
+        device.upload(child_offset), device.upload(children.astype(np.int32)),
+        None if colors is None else device.upload(colors), device.upload(level.astype(np.int32)), level_end,
+        np.array(least), (float(drawn.min()), float(drawn.max())) if len(drawn) else (1.0, 1.0), surface.origin, center,
+        reach)
+
+
+def surfel_colors(device: Device, upload: SlimUpload, shading: Shading) -> DeviceArray:
+    """Return the linear colours (count, 4) float32 that a surface is drawn with."""
+    if shading.model_colors and upload.colors is not None:
+        return upload.colors
+    plain = np.ones((max(upload.count, 1), 4), np.float32)
+    plain[:, :3] = to_linear(shading.color)
+    return device.upload(plain)
+
+
+def place_slim(upload: SlimUpload, matrix: NDArray | None, camera, size, lod: float) -> tuple[NDArray, int]:
+    """Return the view buffer of a placed surface, and the number of surfels that are visited without a search.
+
+    All surfels of the coarse levels whose internal surfels all appear larger than `lod` are visited, and so are those of
+    the next level.
+    """
+    matrix = np.eye(4) if matrix is None else matrix
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    rotation = camera.rotation @ (matrix[:3, :3] / scale)
+    zero = matrix[:3, :3] @ upload.origin + matrix[:3, 3]
+    offset = camera.rotation @ (zero - camera.eye)
+    view = view_floats(camera, size, rotation, offset, scale, lod)
+    p = camera.projection(size)
+    farthest = -(scale * rotation[2] @ upload.center + offset[2]) + scale * upload.reach
+    limit = lod * (farthest if p.perspective else 1.0) * (1 + 1e-4)  # float32 rounding in the kernel
+    large = 2 * scale * max(p.fx, p.fy) * upload.least_internal > limit
+    levels = len(large) if large.all() else int(np.argmin(large))
+    return view, int(upload.level_end[min(levels + 1, len(large))]) if len(large) else 0
+
+
+def select_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: DeviceArray,
+                visited_end: int) -> DeviceArray:
+    """Walk the hierarchy level by level; return which surfels the walk reaches, (count,) uint8."""
+    visited = scratch.array("visited", (max(upload.count, 1),), np.uint8)
+    if visited_end >= upload.count:
+        return visited  # not read: every surfel comes before visited_end
+    device.fill(visited, 0)
+    kernel = device.kernel("render/select_slim.cl", constants={"VW": scratch.lanes})
+    # Levels before the one that ends at visited_end need no search: their children are visited anyway.
+    start = int(np.searchsorted(upload.level_end, visited_end)) - 1
+    for begin, end in zip(upload.level_end[start:-2], upload.level_end[start + 1:-1], strict=True):
+        items = -(-int(end) // scratch.lanes) - int(begin) // scratch.lanes
+        kernel((items,), (min(64, items),), view, upload.planes, upload.stride, upload.flags, upload.child_offset,
+               upload.children, visited, int(begin), int(end), visited_end)
+    return visited
+
+
+def project_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: DeviceArray, visited: DeviceArray,
+                 visited_end: int) -> SlimProjection:
+    """Cut, cull and project all surfels."""
+    n = upload.count
+    device.check_memory(records=4 * RECORD_FLOATS * n, blocks=16 * n, keys=4 * n)
+    out = SlimProjection(scratch.array("records", (n, RECORD_FLOATS), np.float32),
+                         scratch.array("full", (n, 4), np.int16), scratch.array("core", (n, 4), np.int16),
+                         scratch.array("keys", (n,), np.uint32))
+    items = -(-n // scratch.lanes)
+    device.kernel("render/project_slim.cl", constants={"VW": scratch.lanes, "DEGREE": upload.degree})(
+        (items,), (min(16, items),), view, upload.planes, upload.stride, n, upload.flags, upload.footprint, visited,
+        visited_end, out.records, out.full, out.core, out.keys)
+    return out
+
+
+def tile_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, view: DeviceArray,
+              projection: SlimProjection, pairs: PairLists, colors: DeviceArray | None, number: int) -> None:
+    """Draw the surfels of every bin into its planes, the paper's two passes.
+
+    `number` is the surface's place in the scene, for the channel "id".
+    """
+    constants = grid.layout.constants | {"VW": scratch.lanes, "DEGREE": upload.degree, "ORIENTED": upload.oriented,
+                                         "HAS_COLOR": colors is not None, "TILE_BINS": grid.tile_bins}
+    group = 64 if scratch.lanes == 1 else 1
+    device.kernel("render/tile_slim.cl", constants=constants)(
+        (grid.tile_count * group,), (group,), view, pairs.pairs, pairs.offsets, projection.records,
+        view if colors is None else colors, upload.levels, number, grid.tiles_x, grid.tile_count, grid.bins_x,
+        grid.bins_y, grid.touched, grid.planes)
+
+
+def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, matrix, camera, lod: float, number: int,
+              colors: DeviceArray | None) -> None:
+    """Run all stages of one placed surface: select, project, bin, tile."""
+    if upload.count == 0:
+        return
+    floats, visited_end = place_slim(upload, matrix, camera, grid.size, lod)
+    view = device.upload(floats)
+    visited = select_slim(device, scratch, upload, view, visited_end)
+    projection = project_slim(device, scratch, upload, view, visited, visited_end)
+    pairs = bin_pairs(device, scratch, grid, projection.full, projection.core, projection.keys, upload.count)
+    if pairs is not None:
+        tile_slim(device, scratch, grid, upload, view, projection, pairs, colors, number)

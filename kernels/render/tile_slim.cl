@@ -1,0 +1,234 @@
+// Draw the surfels of every bin into its depth and attribute planes: the two passes of the paper's section 3.
+//
+// Pass 1 finds the frontmost hit of the alpha-shrunken balls, pass 2 blends all surfels whose ball holds that point:
+// depth and gradient weighted by G(|q_i - c| / r) = (1 - t^2)^3. A point whose weights add up to less than SUPPORT is
+// the rim of a piece that overshoots; then the pixel looks behind it, up to TRIES times, and keeps the last hit.
+//
+// VW > 1: one work-item per tile of TILE_BINS^2 bins, lanes over blocks of 4x4 pixels (8 lanes: 4x2, 4: 4x1).
+// VW = 1: one work-group of 64 work-items per tile, each a pixel of the bin at hand.
+// Twin: tests/reference/render.py, tile_slim.
+#include "common/slim.clh"
+#include "common/bins.clh"
+#include "common/planes.clh"
+#include "common/view.clh"
+
+#ifndef TILE_BINS
+#define TILE_BINS 4
+#endif
+#ifndef ALPHA
+#define ALPHA 0.8f
+#endif
+#ifndef SUPPORT
+#define SUPPORT 0.3f
+#endif
+#ifndef TRIES
+#define TRIES 4
+#endif
+#ifndef ORIENTED
+#define ORIENTED 1  // hits from behind are set back in pass 1 and never blended with hits from the front
+#endif
+
+#if VW == 1
+#define LANE_X(pixel) ((pixel) & 7)
+#define LANE_Y(pixel) ((pixel) >> 3)
+#else
+#define LANE_X(first) (LANE_INDEX & 3)
+#define LANE_Y(first) (LANE_INDEX >> 2)
+#endif
+
+typedef struct { VF depth, weight, fx, fy, ft, red, green, blue; VI nearest, number; } Blend;
+
+INLINE VI inside_footprint(uint lo, uint hi, VF u, VF v) {
+  const float unit = 1.0f / 255.0f, half_root = 0.70710678f;
+  VF a = (u + v) * half_root, b = (v - u) * half_root;
+  return (u <= (float)(lo & 255u) * unit) & (a <= (float)(lo >> 8 & 255u) * unit)
+       & (v <= (float)(lo >> 16 & 255u) * unit) & (b <= (float)(lo >> 24) * unit)
+       & (-u <= (float)(hi & 255u) * unit) & (-a <= (float)(hi >> 8 & 255u) * unit)
+       & (-v <= (float)(hi >> 16 & 255u) * unit) & (-b <= (float)(hi >> 24) * unit);
+}
+
+// Pass 1: depth of the frontmost hit behind `low` and in front of `z` (in), its side (1, -1) and surfel.
+INLINE void frontmost(__global const uint2 *pairs, int count, uint block, __global const float *records, VF px, VF py,
+                      VF low, VF *z, VF *hit, VF *facing, VI *nearest, int *cost) {
+  for (int e = 0; e < count; e++) {
+    uint2 pair = pairs[e];
+    if (!(pair.y & block)) continue;
+    if (!any_lane(near_of_key(pair.y) < *z)) continue;
+    __global const float *k = records + (size_t)(pair.x & ~FROM_BEHIND) * RECORD_FLOATS;
+    float side = pair.x & FROM_BEHIND ? -1.0f : 1.0f;
+    VF x = px - k[XR], y = py - k[YR], s, slope;
+    VF u = k[U0] + k[UX] * x + k[UY] * y, v = k[V0] + k[VX] * x + k[VY] * y, w = k[W0] + k[WX] * x + k[WY] * y;
+    VF du = k[DU] + k[INV_T] * u, dv = k[DV] + k[INV_T] * v, dw = k[DW] + k[INV_T] * w;
+    RayPoly p = ray_poly(k, u, v, w, du, dv, dw);
+    VI good = ray_root(p, side, &s, &slope);
+    u += s * du; v += s * dv; w += s * dw;
+    VF t = s + k[T_REF];
+    VF key = t;
+    if (ORIENTED && side < 0.0f) key = t + k[BIAS];
+    good = good & (u * u + v * v + w * w < ALPHA * ALPHA) & (t > low) & (key < *z);
+    uint lo = as_uint(k[FOOT_LO]), hi = as_uint(k[FOOT_HI]);
+    if ((lo & hi) != 0xffffffffu) good = good & inside_footprint(lo, hi, u, v);
+    *z = SEL(*z, key, good);
+    *hit = SEL(*hit, t, good);
+    *facing = SEL(*facing, (VF)(side), good);
+#if FIELD_LEVEL >= 0
+    *nearest = SEL(*nearest, (VI)((int)(pair.x & ~FROM_BEHIND)), good);
+#endif
+    *cost += 1;
+  }
+}
+
+// Pass 2: blend the surfels whose ball holds the point at depth `hit` (INFINITY: no point).
+INLINE Blend blended(__global const uint2 *pairs, int count, uint block, __global const float *records,
+                     __global const float4 *colors, VF px, VF py, VF hit, VF facing, int *cost) {
+  Blend sum;
+  sum.depth = 0.0f; sum.weight = 0.0f; sum.fx = 0.0f; sum.fy = 0.0f; sum.ft = 0.0f;
+  sum.red = 0.0f; sum.green = 0.0f; sum.blue = 0.0f; sum.nearest = 0; sum.number = 0;
+  for (int e = 0; e < count; e++) {
+    uint2 pair = pairs[e];
+    if (!(pair.y & block)) continue;
+    uint index = pair.x & ~FROM_BEHIND;
+    __global const float *k = records + (size_t)index * RECORD_FLOATS;
+    float side = pair.x & FROM_BEHIND ? -1.0f : 1.0f;
+    VF s = hit - k[T_REF];
+    VI inside = (s < k[REACH]) & (s > -k[REACH]);
+    if (ORIENTED) inside = inside & (facing == side);
+    if (!any_lane(inside)) continue;
+    VF x = px - k[XR], y = py - k[YR], step, slope;
+    VF u = k[U0] + k[UX] * x + k[UY] * y, v = k[V0] + k[VX] * x + k[VY] * y, w = k[W0] + k[WX] * x + k[WY] * y;
+    VF du = k[DU] + k[INV_T] * u, dv = k[DV] + k[INV_T] * v, dw = k[DW] + k[INV_T] * w;
+    u += s * du; v += s * dv; w += s * dw;
+    inside = inside & (u * u + v * v + w * w < 1.0f);
+    if (!any_lane(inside)) continue;
+    RayPoly p = ray_poly(k, u, v, w, du, dv, dw);
+    inside = inside & ray_root(p, side, &step, &slope);
+    u += step * du; v += step * dv; w += step * dw;
+    VF g = 1.0f - (u * u + v * v + w * w), gu, gv;
+    inside = inside & (g > 0.0f);
+    VF weight = SEL((VF)(0.0f), g * g * g, inside);
+    height_slope(k, u, v, &gu, &gv);
+    VF tilt = weight * (side * k[RADIUS_PX]);
+    sum.weight += weight;
+    sum.depth += weight * SEL((VF)(0.0f), step, inside);
+    sum.fx += tilt * (k[WX] - gu * k[UX] - gv * k[VX]);
+    sum.fy += tilt * (k[WY] - gu * k[UY] - gv * k[VY]);
+    sum.ft -= weight * k[RADIUS] * SEL((VF)(0.0f), slope, inside);
+#if HAS_COLOR
+    float4 color = colors[index];
+    sum.red += weight * color.x; sum.green += weight * color.y; sum.blue += weight * color.z;
+#endif
+#if FIELD_COUNT >= 0
+    sum.number += SEL((VI)(0), (VI)(1), inside);
+#endif
+    *cost += 1;
+  }
+  return sum;
+}
+
+// One block (VW = 1: one pixel) of a bin.
+INLINE int draw_block(__global const float *view, __global const uint2 *pairs, int count, uint block,
+                      __global const float *records, __global const float4 *colors, __global const int *levels,
+                      __global float *planes, int was_touched, int surface, VI lane_x, VI lane_y, int bin_x, int bin_y,
+                      int at) {
+  VF px = TO_VF(lane_x) + (bin_x * BIN + 0.5f), py = TO_VF(lane_y) + (bin_y * BIN + 0.5f);
+  VF before = EMPTY_DEPTH;
+  if (was_touched) before = load_plane(planes, FIELD_DEPTH, at);
+  VF low = view[NEAR], infinite = INFINITY;
+  VI active = TRUE_LANES, any_hit = 0;
+  Blend best;
+  best.depth = infinite;
+  best.weight = best.fx = best.fy = best.ft = best.red = best.green = best.blue = 1.0f;
+  best.nearest = 0; best.number = 0;
+  int cost = 0;
+  for (int attempt = 0; attempt < TRIES; attempt++) {
+    VF z = SEL(-infinite, before, active), hit = infinite, facing = 0.0f;
+    VI nearest = 0;
+    frontmost(pairs, count, block << 4, records, px, py, low, &z, &hit, &facing, &nearest, &cost);
+    VI found = hit < infinite;
+    if (!any_lane(found)) break;
+    Blend sum = blended(pairs, count, block, records, colors, px, py, hit, facing, &cost);
+    found = found & (sum.weight > 0.0f);
+    sum.depth = hit + sum.depth / sum.weight;
+#define KEEP(x) best.x = SEL(best.x, sum.x, found)
+    KEEP(depth); KEEP(weight); KEEP(fx); KEEP(fy); KEEP(ft); KEEP(number);
+    best.nearest = SEL(best.nearest, nearest, found);
+#if HAS_COLOR
+    KEEP(red); KEEP(green); KEEP(blue);
+#endif
+    any_hit = any_hit | found;
+    active = found & (sum.weight < SUPPORT);
+    low = SEL(low, hit, active);
+    if (!any_lane(active)) break;
+  }
+  VI closer = any_hit & (best.depth < before);
+  if (was_touched && !any_lane(closer)) return cost;
+  store_plane(planes, FIELD_DEPTH, at, SEL(before, best.depth, closer));
+  if (!any_lane(closer)) return cost;
+  float fx = view[FX], fy = view[FY];
+  VF gx = best.fx * fx, gy = -best.fy * fy;
+  VF gz = view[PERSPECTIVE] > 0.0f ? gx * ((px - view[CX]) / fx) + gy * ((view[CY] - py) / fy) - best.ft : -best.ft;
+  merge_plane(planes, FIELD_NORMAL, at, gx, closer);
+  merge_plane(planes, FIELD_NORMAL + 1, at, gy, closer);
+  merge_plane(planes, FIELD_NORMAL + 2, at, gz, closer);
+#if FIELD_COLOR >= 0
+  VF inv = 1.0f / best.weight;
+  merge_plane(planes, FIELD_COLOR, at, best.red * inv, closer);
+  merge_plane(planes, FIELD_COLOR + 1, at, best.green * inv, closer);
+  merge_plane(planes, FIELD_COLOR + 2, at, best.blue * inv, closer);
+#endif
+#if FIELD_ID >= 0
+  merge_plane(planes, FIELD_ID, at, AS_VF((VI)(surface)), closer);
+#endif
+#if FIELD_COUNT >= 0
+  merge_plane(planes, FIELD_COUNT, at, AS_VF(best.number), closer);
+#endif
+#if FIELD_LEVEL >= 0
+  VI level;
+  for (int i = 0; i < VW; i++) ((int *)&level)[i] = levels[((int *)&best.nearest)[i]];
+  merge_plane(planes, FIELD_LEVEL, at, AS_VF(level), closer);
+#endif
+  return cost;
+}
+
+__kernel void tile_slim(__global const float *view, __global const uint2 *pairs, __global const uint *offsets,
+                        __global const float *records, __global const float4 *colors, __global const int *levels,
+                        int surface, int tiles_x, int tile_count, int bins_x, int bins_y,
+                        __global int *touched /* pixel evaluations so far, -1: none */, __global float *tile_planes) {
+#if VW == 1
+  __local int cost;
+  int tile = get_group_id(0), pixel = get_local_id(0);
+#else
+  int tile = get_global_id(0);
+#endif
+  if (tile >= tile_count) return;
+  int x0 = tile % tiles_x * TILE_BINS, y0 = tile / tiles_x * TILE_BINS;
+  for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
+    int bin_x = x0 + i % TILE_BINS, bin_y = y0 + i / TILE_BINS;
+    if (bin_x >= bins_x || bin_y >= bins_y) continue;
+    int bin = bin_y * bins_x + bin_x;
+    int begin = offsets[bin], count = offsets[bin + 1] - begin;
+    if (count == 0) continue;
+    __global float *planes = tile_planes + (size_t)bin * BIN_PIXELS * FIELDS;
+    int was_touched = touched[bin] >= 0;
+#if VW == 1
+    uint block = 1u << ((pixel & 7) >> 2 | (pixel >> 5) << 1);
+    int mine = draw_block(view, pairs + begin, count, block, records, colors, levels, planes, was_touched, surface,
+                          LANE_X(pixel), LANE_Y(pixel), bin_x, bin_y, pixel);
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    if (pixel == 0) cost = was_touched ? touched[bin] : 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    atomic_add(&cost, mine);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (pixel == 0) touched[bin] = cost;
+#else
+    int cost = 0;
+    for (int b = 0; b < 64 / VW; b++) {
+      int quarter = b / (16 / VW), part = b % (16 / VW);
+      int qx = (quarter & 1) * 4, qy = (quarter >> 1) * 4 + part * (VW / 4);
+      cost += draw_block(view, pairs + begin, count, 1u << quarter, records, colors, levels, planes, was_touched, surface,
+                         qx + LANE_X(0), qy + LANE_Y(0), bin_x, bin_y, qy * BIN + qx);
+    }
+    touched[bin] = (was_touched ? touched[bin] : 0) + cost * VW;
+#endif
+  }
+}
