@@ -38,8 +38,10 @@ def compared(before: dict, after: dict) -> list[dict]:
         ratio = b / a if a else float("nan") if b else 1.0
         rising = b > a * (1 + noise) if a >= 0 else b > a
         falling = b < a / (1 + noise) if a >= 0 else b < a
-        good_up = any(word in name for word in MORE_IS_BETTER)
-        verdict = ("better" if good_up else "worse") if rising else ("worse" if good_up else "better") if falling else ""
+        improved = falling
+        if any(word in name for word in MORE_IS_BETTER):
+            improved = rising
+        verdict = "" if not (rising or falling) else "better" if improved else "worse"
         rows.append({"name": name, "before": a, "after": b, "ratio": ratio, "noise": noise, "verdict": verdict})
     return rows
 

@@ -105,11 +105,11 @@ def vtk_window(mesh, size) -> VtkWindow | None:
     return window
 
 
-def apss(mesh) -> dict | None:
-    """Return MeshLab's APSS on the scan's own points: seconds, and the root mean square of how far it moved them.
+def apss(mesh, resolution: int = 200) -> dict | None:
+    """Return MeshLab's APSS surface of the scan's points: seconds, RMS of the points to it (world units), vertices.
 
-    The distances are comparable with those of the points to a SLIM surface: both say how far a smooth surface made
-    from the points lies from them. World units. None after a line where MeshLab is not installed.
+    Its projection filter crashes in pymeshlab 2025.7 on any mesh, so its marching cubes stand for it, on a grid of
+    `resolution` cells along the longest side. None after a line where MeshLab is not installed or fails.
     """
     try:
         import pymeshlab
@@ -117,13 +117,17 @@ def apss(mesh) -> dict | None:
         print("peer MeshLab: not installed (pip install clsurf[bench])")
         return None
     meshes = pymeshlab.MeshSet(verbose=False)
-    points = np.asarray(mesh.vertices, np.float64)
-    for _ in range(2):  # the surface's own mesh, and the copy whose vertices are projected
-        meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, face_matrix=np.asarray(mesh.faces, np.int32),
-                                       v_normals_matrix=np.asarray(mesh.normals, np.float64)))
-    start = time.perf_counter()
-    meshes.compute_mls_projection_apss(controlmesh=0, proxymesh=1)
-    seconds = time.perf_counter() - start
-    moved = np.linalg.norm(meshes.mesh(1).vertex_matrix() - points, axis=1)
-    good = np.isfinite(moved)
-    return {"seconds": seconds, "rms": float(np.sqrt(np.mean(moved[good] ** 2))), "lost": int((~good).sum())}
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=np.asarray(mesh.vertices, np.float64),
+                                   face_matrix=np.asarray(mesh.faces, np.int32)))
+    meshes.compute_normal_per_vertex()
+    try:
+        start = time.perf_counter()
+        meshes.generate_marching_cubes_apss(resolution=resolution)
+        seconds = time.perf_counter() - start
+        made = meshes.current_mesh_id()
+        distances = meshes.get_hausdorff_distance(sampledmesh=0, targetmesh=made, samplevert=True, sampleedge=False,
+                                                  sampleface=False, samplenum=len(mesh.vertices))
+    except pymeshlab.PyMeshLabException as error:
+        print(f"peer MeshLab: not measured ({error})")
+        return None
+    return {"seconds": seconds, "rms": distances["RMS"], "vertices": meshes.mesh(made).vertex_number()}

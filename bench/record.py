@@ -110,7 +110,8 @@ def read(path) -> dict:
     try:
         result = json.loads(Path(path).read_text())
     except (OSError, ValueError) as error:
-        raise FileFormatError(f"bench figures {path}: expected a JSON file of `clsurf bench --json`, got {error}") from None
+        raise FileFormatError(f"bench figures {path}: expected a JSON file of `clsurf bench --json`, got "
+                              f"{error}") from None
     if not isinstance(result, dict) or result.get("format") != FORMAT:
         raise FileFormatError(f"bench figures {path}: expected the format {FORMAT!r}: measure again with this version")
     return result

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from clsurf.errors import InputError
+from clsurf.io.scans import load_scan
 
 from .truth import mesh_key
 
@@ -56,14 +57,14 @@ def scene(name: str) -> Scene:
     InputError
         The scan's file is missing.
     """
-    import clsurf
     if name == "demo":
-        return Scene(name, clsurf.models.demo_scan())
+        from clsurf.models import demo_scan
+        return Scene(name, demo_scan())
     path = data_folder() / FILES[name]
     if not path.exists():
         raise InputError(f"scene {name}: expected the scan {FILES[name]} in the folder that CLSURF_DATA names, found "
                          f"none: set CLSURF_DATA, or use --quick for a generated scan")
-    return Scene(name, clsurf.load(path))
+    return Scene(name, load_scan(path))
 
 
 def chosen(names, quick: bool) -> list[str]:

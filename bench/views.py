@@ -24,7 +24,8 @@ def views(box, count: int = 8) -> list[Camera]:
             for i, azimuth in enumerate(AZIMUTHS[:count])]
 
 
-def orbit(box, frames: int, height_px: float | None = None, picture_px: int = 1024, start: float = 30.0) -> list[Camera]:
+def orbit(box, frames: int, height_px: float | None = None, picture_px: int = 1024,
+          start: float = 30.0) -> list[Camera]:
     """Return `frames` cameras that go around a (2, 3) box, 1 degree a frame.
 
     Parameters
