@@ -1,0 +1,8 @@
+"""Generated scans, for tests, demonstrations and where no data file is at hand."""
+
+from .amphora import demo_scan as demo_scan
+from .basic import cylinder as cylinder
+from .basic import disc as disc
+from .basic import ellipsoid as ellipsoid
+from .basic import sphere as sphere
+from .basic import torus as torus
