@@ -1,6 +1,7 @@
 """Points sorted along the Morton curve, with a 16-wide tree of boxes for ball queries on the device."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,26 +44,29 @@ class PointTree:
     node_offset: DeviceArray
     top_level: int
     scale: float
+    cells_of_step: dict = field(default_factory=dict)
 
     @property
     def arguments(self) -> tuple:
         """The kernel arguments of a ball query: padded, sorted, boxes, node_offset, top_level."""
         return self.padded, self.sorted, self.boxes, self.node_offset, self.top_level
 
-    def cells(self, width: float) -> tuple[list[NDArray], list[NDArray]]:
+    def cells(self, width: float) -> list[tuple[DeviceArray, DeviceArray]]:
         """Return first and last + 1 point of the occupied cells at least `width` wide, one pair of arrays per colour.
 
-        The colour of a cell is the parity of its three integer coordinates: 8 colours.
+        The colour of a cell is the parity of its three integer coordinates: up to 8 colours.
         """
-        finest = 1.0 / self.scale
-        step = max(0, int(np.ceil(np.log2(max(width / finest, 1.0)))))
+        step = max(0, math.ceil(math.log2(max(width * self.scale, 1.0))))
         step = min(step, self.bits)
-        cell = self.codes >> np.uint64(3 * step)
-        start = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]])).astype(np.int32)
-        end = np.append(start[1:], np.int32(self.count)).astype(np.int32)
-        color = (cell[start] & np.uint64(7)).astype(np.uint8)
-        groups = [np.flatnonzero(color == c) for c in range(8)]
-        return [start[g] for g in groups if len(g)], [end[g] for g in groups if len(g)]
+        if step not in self.cells_of_step:
+            cell = self.codes >> np.uint64(3 * step)
+            start = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]])).astype(np.int32)
+            end = np.append(start[1:], np.int32(self.count)).astype(np.int32)
+            color = (cell[start] & np.uint64(7)).astype(np.uint8)
+            groups = [np.flatnonzero(color == c) for c in range(8)]
+            self.cells_of_step[step] = [(self.device.upload(start[g]), self.device.upload(end[g]))
+                                        for g in groups if len(g)]
+        return self.cells_of_step[step]
 
 
 def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: float, device: Device) -> PointTree:

@@ -16,12 +16,16 @@ from ..errors import Cancelled, InputError
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.slim import COEFFICIENTS, SlimSurface
-from .point_tree import PointTree, build_point_tree
+from .point_tree import BLOCK, PointTree, build_point_tree
 from .radius import LEAST_PENALTY, noise_lambda, robust_box, segment_end
 
 GAMMA = 0.1  # overlap that every point must have (paper: 0.1)
 OVERLAP_ONE = 1 << 20  # fixed point of the overlap sums (cover_points.cl)
 LEVELS = 25  # the last one's balls are 1e-6 of the diagonal, the rounding of the coordinates
+CENTER = 2  # state of a chosen point (choose_centers.cl)
+# Centres of a level's first round stand r_r apart; those that fill the gaps between leaves r_r / 2: 5 % fewer leaves
+# than with r_r throughout, at the same error, in a third of the rounds.
+NEXT_SPACING = 0.5
 RECORD = 16  # floats a fitted surfel (fit_surfels.cl)
 SEGMENT, FORCED, FIXED = 0, 1, 2  # modes of fit_surfels.cl
 
@@ -126,8 +130,10 @@ def build_levels(tree: PointTree, degree: int, penalty: float, progress=None, fi
     choose = device.kernel("build/choose_centers.cl")
     fit = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree})
     cover = device.kernel("build/cover_points.cl")
-    overlap = device.zeros(tree.padded, np.uint32)
-    held = device.empty(tree.padded, np.uint8)
+    mark_open = device.kernel("build/open_points.cl")
+    blocks = tree.padded // BLOCK
+    overlap, held = device.zeros(tree.padded, np.uint32), device.empty(tree.padded, np.uint8)
+    state, blocks_open = device.empty(tree.padded, np.uint8), device.empty(blocks, np.uint8)
     threshold = int(GAMMA * OVERLAP_ONE * 1.001) + 1
     levels = []
     for number in range(1, LEVELS + 1):
@@ -135,28 +141,23 @@ def build_levels(tree: PointTree, degree: int, penalty: float, progress=None, fi
         mode = FIXED if fixed_radius else FORCED if number == LEVELS else SEGMENT
         device.fill(held, 0)
         centers, records = [], []
-        spacing = r_r
         while True:
-            state = (device.download(overlap, copy=False) >= threshold) | (device.download(held, copy=False) != 0)
-            if state[:tree.count].all():
+            mark_open((blocks,), (64,), tree.count, blocks, threshold, overlap, held, state, blocks_open)
+            spacing = r_r * (NEXT_SPACING if centers else 1.0)
+            for start, end in tree.cells(spacing * 1.001):
+                choose((len(start),), (1,), len(start), start, end, spacing, *tree.arguments, blocks_open, state)
+            chosen = np.flatnonzero(device.download(state, copy=False) == CENTER).astype(np.int32)
+            if len(chosen) == 0:
                 break
-            on_device = device.upload(state.astype(np.uint8))
-            for start, end in zip(*tree.cells(spacing * 1.001), strict=True):
-                choose((len(start),), (1,), len(start), device.upload(start), device.upload(end), spacing,
-                       *tree.arguments, on_device)
-            chosen = np.flatnonzero(device.download(on_device, copy=False)[:tree.count] == 2).astype(np.int32)
             center = device.upload(chosen)
-            out = device.empty((len(chosen), RECORD), np.float32)
-            fit((len(chosen),), (1,), len(chosen), center, r_r, penalty, need, mode, *tree.arguments, out)
-            record = device.download(out)
-            cover((len(chosen),), (1,), len(chosen), center, device.upload(record[:, 0]),
-                  device.upload(record[:, 1:4]), device.upload(record[:, 5], np.uint8), *tree.arguments, overlap, held)
-            device.finish()
+            record = device.empty((len(chosen), RECORD), np.float32)
+            fit((len(chosen),), (1,), len(chosen), center, r_r, penalty, need, mode, *tree.arguments, record)
+            cover((len(chosen),), (1,), len(chosen), center, record, *tree.arguments, overlap, held)
             centers.append(chosen)
             records.append(record)
         if not centers:
             break
-        levels.append(Level(np.concatenate(centers), np.concatenate(records)))
+        levels.append(Level(np.concatenate(centers), np.concatenate([device.download(r, copy=False) for r in records])))
         if progress is not None:
             covered = np.count_nonzero(device.download(overlap, copy=False)[:tree.count] >= threshold) / tree.count
             if progress("build", covered) is False:

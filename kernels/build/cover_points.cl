@@ -12,9 +12,10 @@
 #define COVER_COSINE 0.2f // a leaf represents points whose normals are within about 78 degrees of its own
 #endif
 #define ONE 1048576.0f
+#define RECORD 16 // see fit_surfels.cl
 
-__kernel void cover_points(int count, __global const int *center, __global const float *radius,
-                           __global const float *normal, __global const uchar *leaf, int padded,
+__kernel void cover_points(int count, __global const int *center, __global const float *record,
+                           int padded,
                            __global const float *sorted, __global const float *boxes, __global const int *node_offset,
                            int top_level, __global uint *overlap, __global uchar *held) {
   int s = get_global_id(0);
@@ -22,9 +23,10 @@ __kernel void cover_points(int count, __global const int *center, __global const
   size_t n = padded;
   __global const float *px = sorted, *py = sorted + n, *pz = sorted + 2 * n;
   __global const float *nx = sorted + 3 * n, *ny = sorted + 4 * n, *nz = sorted + 5 * n;
-  int c = center[s], is_leaf = leaf[s];
-  float x = px[c], y = py[c], z = pz[c], r = is_leaf ? ALPHA * radius[s] : radius[s];
-  float ux = normal[3 * s], uy = normal[3 * s + 1], uz = normal[3 * s + 2];
+  __global const float *surfel = record + RECORD * (size_t)s;
+  int c = center[s], is_leaf = surfel[5] > 0.0f;
+  float x = px[c], y = py[c], z = pz[c], r = is_leaf ? ALPHA * surfel[0] : surfel[0];
+  float ux = surfel[1], uy = surfel[2], uz = surfel[3];
   float r2 = r * r, inverse = 1.0f / r2;
   uint list[BLOCK_LIST];
   Traversal t;
