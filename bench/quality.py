@@ -72,7 +72,7 @@ def _components_without(mask, excluded) -> NDArray:
     return ~spoiled[label]
 
 
-def measure(truth: Truth, depth: NDArray, normal: NDArray | None, diagonal: float) -> dict[str, float]:
+def measure(truth: Truth, depth: NDArray, normal: NDArray | None, diagonal: float, axis) -> dict[str, float]:
     """Return the figures of one view.
 
     Parameters
@@ -83,14 +83,17 @@ def measure(truth: Truth, depth: NDArray, normal: NDArray | None, diagonal: floa
         Unit, facing the eye.
     diagonal : float
         Of the scan's box, world units.
+    axis : (3,)
+        The viewing axis, world space, unit.
 
     Returns
     -------
     dict
         The counts of `COUNTS` (pixels; fragments: components), ``depth_median`` and ``depth_rms`` in % of the
-        diagonal (the median over all pixels hit by both, the root mean square without the outliers), and
-        ``normal_median`` and ``normal_facet_median`` in degrees: against the mesh's interpolated normals and against
-        those of its triangles.
+        diagonal (the median over all pixels hit by both, the root mean square without the outliers),
+        ``distance_median`` (the depth error times the cosine between viewing axis and normal: how far the surfaces
+        are apart, % of the diagonal), ``normals_missing`` (pixels with a depth and no finite normal), and ``normal_median`` and
+        ``normal_facet_median`` in degrees: against the mesh's interpolated normals and those of its triangles.
     """
     found = masks(truth, depth, diagonal)
     figures = {name: int(np.count_nonzero(found[name])) for name in COUNTS}
@@ -99,12 +102,16 @@ def measure(truth: Truth, depth: NDArray, normal: NDArray | None, diagonal: floa
     both = truth.hit & np.isfinite(depth)
     figures["pixels"] = int(np.count_nonzero(truth.hit))
     if not both.any():
-        return figures | dict.fromkeys(("depth_median", "depth_rms", "normal_median", "normal_facet_median"), np.nan)
+        return figures | dict.fromkeys(("depth_median", "depth_rms", "distance_median"), np.nan)
     error = 100 * np.abs(depth[both].astype(np.float64) - truth.depth[both]) / diagonal
     good = error <= 100 * OUTLIER
     figures["depth_median"] = float(np.median(error))
     figures["depth_rms"] = float(np.sqrt(np.mean(error[good] ** 2))) if good.any() else np.nan
+    tilt = np.abs((truth.normal[both] * axis).sum(axis=1))
+    figures["distance_median"] = float(np.median(error * tilt))
     if normal is not None:
+        figures["normals_missing"] = int(np.count_nonzero(np.isfinite(depth) & ~np.isfinite(normal).all(axis=2)))
+        good &= np.isfinite(normal[both]).all(axis=1)
         for name, exact in (("normal_median", truth.normal), ("normal_facet_median", truth.facet)):
             cosine = (normal[both][good].astype(np.float64) * exact[both][good]).sum(axis=1)
             figures[name] = float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))) if good.any() else np.nan
