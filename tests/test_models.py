@@ -68,9 +68,9 @@ def test_demo_scan_normals_point_outwards():
     assert (scan.normals[scan.points[:, 1] < 0.001, 1] < 0).any()
 
 
-@pytest.mark.parametrize("make", [lambda: models.sphere(0), lambda: models.torus(10, minor=2), lambda: models.disc(5, -1),
-                                  lambda: models.ellipsoid(5, (1, 2)), lambda: models.demo_scan(3),
-                                  lambda: models.cylinder(5, np.nan)])
+@pytest.mark.parametrize("make", [
+    lambda: models.sphere(0), lambda: models.torus(10, minor=2), lambda: models.disc(5, -1),
+    lambda: models.ellipsoid(5, (1, 2)), lambda: models.demo_scan(3), lambda: models.cylinder(5, np.nan)])
 def test_bad_sizes(make):
     with pytest.raises(InputError, match="expected"):
         make()
