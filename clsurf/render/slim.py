@@ -3,6 +3,7 @@
 Source: Ohtake, Belyaev, Alexa, SGP 2005, section 3. Kernels: kernels/render/*slim.cl.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.slim import SlimSurface
 from .shade import Shading, to_linear
-from .tiles import Grid, PairLists, Scratch, bin_pairs, view_floats
+from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, new_footprints, view_floats
 
 RECORD_FLOATS = 32  # kernels/common/slim.clh
 PLANES = 21  # kernels/common/select_slim.clh: 11 + up to 10 coefficients
@@ -43,16 +44,6 @@ class SlimUpload:
     origin: NDArray  # (3,) float64
     center: NDArray  # (3,) float64, relative to origin
     reach: float  # every ball lies within this of `center`
-
-
-@dataclass(frozen=True, eq=False)
-class SlimProjection:
-    """What `project_slim` made for one frame."""
-
-    records: DeviceArray  # (count, 32) float32
-    full: DeviceArray  # (count, 4) int16, blocks of 4x4 pixels
-    core: DeviceArray  # (count, 4) int16
-    keys: DeviceArray  # (count,) uint32
 
 
 def height_bounds(degree: int, k: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -147,7 +138,7 @@ def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
     values = np.unique(level)
     level_end = np.concatenate([[0], np.searchsorted(level, values, side="right")])
     least = [np.min(size_radius[a:b][~leaf[a:b] & usable[a:b]], initial=np.inf)
-             for a, b in zip(level_end[:-1], level_end[1:], strict=True)]
+             for a, b in itertools.pairwise(level_end)]
     colors = None
     if surface.colors is not None:
         colors = np.ones((n, 4), np.float32)
@@ -178,17 +169,18 @@ def surfel_colors(device: Device, upload: SlimUpload, shading: Shading) -> Devic
 def place_slim(upload: SlimUpload, matrix: NDArray | None, camera, size, lod: float) -> tuple[NDArray, int]:
     """Return the view buffer of a placed surface, and the number of surfels that are visited without a search.
 
-    All surfels of the coarse levels whose internal surfels all appear larger than `lod` are visited, and so are those of
-    the next level.
+    All surfels of the coarse levels whose internal surfels all appear larger than `lod` are visited, and so are those
+    of the next level.
     """
     matrix = np.eye(4) if matrix is None else matrix
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     rotation = camera.rotation @ (matrix[:3, :3] / scale)
     zero = matrix[:3, :3] @ upload.origin + matrix[:3, 3]
     offset = camera.rotation @ (zero - camera.eye)
-    view = view_floats(camera, size, rotation, offset, scale, lod)
     p = camera.projection(size)
-    farthest = -(scale * rotation[2] @ upload.center + offset[2]) + scale * upload.reach
+    middle, reach = -(scale * rotation[2] @ upload.center + offset[2]), scale * upload.reach
+    farthest = middle + reach
+    view = view_floats(camera, size, rotation, offset, scale, lod, (middle - reach, farthest))
     limit = lod * (farthest if p.perspective else 1.0) * (1 + 1e-4)  # float32 rounding in the kernel
     large = 2 * scale * max(p.fx, p.fy) * upload.least_internal > limit
     levels = len(large) if large.all() else int(np.argmin(large))
@@ -213,22 +205,20 @@ def select_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: Devi
 
 
 def project_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: DeviceArray, visited: DeviceArray,
-                 visited_end: int) -> SlimProjection:
-    """Cut, cull and project all surfels."""
+                 visited_end: int) -> tuple[DeviceArray, Footprints]:
+    """Cut, cull and project all surfels; return their records (count, 32) float32 and where they touch the picture."""
     n = upload.count
-    device.check_memory(records=4 * RECORD_FLOATS * n, blocks=16 * n, keys=4 * n)
-    out = SlimProjection(scratch.array("records", (n, RECORD_FLOATS), np.float32),
-                         scratch.array("full", (n, 4), np.int16), scratch.array("core", (n, 4), np.int16),
-                         scratch.array("keys", (n,), np.uint32))
+    device.check_memory(records=4 * RECORD_FLOATS * n)
+    records, touch = scratch.array("records", (n, RECORD_FLOATS), np.float32), new_footprints(device, scratch, n)
     items = -(-n // scratch.lanes)
     device.kernel("render/project_slim.cl", constants={"VW": scratch.lanes, "DEGREE": upload.degree})(
         (items,), (min(16, items),), view, upload.planes, upload.stride, n, upload.flags, upload.footprint, visited,
-        visited_end, out.records, out.full, out.core, out.keys)
-    return out
+        visited_end, records, touch.full, touch.core, touch.keys, touch.buckets)
+    return records, touch
 
 
 def tile_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, view: DeviceArray,
-              projection: SlimProjection, pairs: PairLists, colors: DeviceArray | None, number: int) -> None:
+              records: DeviceArray, pairs: PairLists, colors: DeviceArray | None, number: int) -> None:
     """Draw the surfels of every bin into its planes, the paper's two passes.
 
     `number` is the surface's place in the scene, for the channel "id".
@@ -237,7 +227,7 @@ def tile_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, 
                                          "HAS_COLOR": colors is not None, "TILE_BINS": grid.tile_bins}
     group = 64 if scratch.lanes == 1 else 1
     device.kernel("render/tile_slim.cl", constants=constants)(
-        (grid.tile_count * group,), (group,), view, pairs.pairs, pairs.offsets, projection.records,
+        (grid.tile_count * group,), (group,), view, pairs.pairs, pairs.offsets, records,
         view if colors is None else colors, upload.levels, number, grid.tiles_x, grid.tile_count, grid.bins_x,
         grid.bins_y, grid.touched, grid.planes)
 
@@ -250,7 +240,7 @@ def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, 
     floats, visited_end = place_slim(upload, matrix, camera, grid.size, lod)
     view = device.upload(floats)
     visited = select_slim(device, scratch, upload, view, visited_end)
-    projection = project_slim(device, scratch, upload, view, visited, visited_end)
-    pairs = bin_pairs(device, scratch, grid, projection.full, projection.core, projection.keys, upload.count)
+    records, footprints = project_slim(device, scratch, upload, view, visited, visited_end)
+    pairs = bin_pairs(device, scratch, grid, footprints, upload.count)
     if pairs is not None:
-        tile_slim(device, scratch, grid, upload, view, projection, pairs, colors, number)
+        tile_slim(device, scratch, grid, upload, view, records, pairs, colors, number)

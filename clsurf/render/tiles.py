@@ -13,6 +13,7 @@ from ..device import Device, DeviceArray
 
 BIN = 8  # pixels; kernels/common/bins.clh
 VIEW_FLOATS = 32  # kernels/common/view.clh
+DEPTH_BUCKETS = 2048  # kernels/common/bins.clh
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class PairLists:
     total: int
 
 
-def view_floats(camera, size, rotation=None, offset=None, scale=1.0, lod=0.0) -> NDArray:
+def view_floats(camera, size, rotation=None, offset=None, scale=1.0, lod=0.0, depths=(0.0, 1.0)) -> NDArray:
     """Return the view buffer (32,) float32 of kernels/common/view.clh.
 
     Parameters
@@ -92,6 +93,8 @@ def view_floats(camera, size, rotation=None, offset=None, scale=1.0, lod=0.0) ->
         Model units to world units.
     lod : float
         Projected diameter in pixels up to which internal surfels are drawn.
+    depths : (float, float)
+        Range of depths that the front-to-back order resolves; others fall into the first and last bucket.
     """
     p = camera.projection(size)
     out = np.zeros(VIEW_FLOATS, np.float32)
@@ -100,46 +103,73 @@ def view_floats(camera, size, rotation=None, offset=None, scale=1.0, lod=0.0) ->
     out[10:13] = 0 if offset is None else offset
     out[13:17] = p.fx, p.fy, p.cx, p.cy
     out[17:22] = p.perspective, max(camera.near, np.finfo(np.float32).min), size[0], size[1], lod
+    out[22:24] = depths[0], max((depths[1] - depths[0]) / DEPTH_BUCKETS, 1e-30)
     return out
 
 
-def bin_pairs(device: Device, scratch, grid: Grid, full: DeviceArray, core: DeviceArray, keys: DeviceArray,
-              count: int) -> PairLists | None:
-    """Count, scan, fill and sort the pairs of `count` primitives; None where nothing touches the picture.
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Where the primitives of one surface may touch the picture, for `bin_pairs`; (count, ...) each."""
 
-    Parameters
-    ----------
-    scratch : Scratch
-        Keeps buffers between frames.
-    full, core : (count, 4) int16
-        First and last block of 4x4 pixels in x and y that pass 2 and pass 1 may touch; x first > x last: none.
-    keys : (count,) uint32
-        Front-to-back order in the high 24 bits; bit 0: seen from the front, bit 1: from behind.
+    full: DeviceArray  # (count, 4) int16: first and last block of 4x4 pixels, x and y, of pass 2; first x > last x: none
+    core: DeviceArray  # (count, 4) int16: the same of pass 1
+    keys: DeviceArray  # (count,) uint32: least depth in the high 24 bits; bit 0: seen from the front, bit 1: from behind
+    buckets: DeviceArray  # (count,) uint16: depth bucket
+
+
+def new_footprints(device: Device, scratch: "Scratch", count: int) -> Footprints:
+    """Return room for the footprints of `count` primitives."""
+    device.check_memory(blocks=16 * count, keys=4 * count, buckets=2 * count)
+    return Footprints(scratch.array("full", (count, 4), np.int16), scratch.array("core", (count, 4), np.int16),
+                      scratch.array("keys", (count,), np.uint32), scratch.array("buckets", (count,), np.uint16))
+
+
+def order_depths(device: Device, scratch: "Scratch", footprints: Footprints, count: int):
+    """Return the drawn primitives front to back, (count,) uint32, and the offsets of the depth buckets.
+
+    The last offset is the number of drawn primitives.
     """
-    bins, lanes = grid.bin_count, scratch.lanes
-    # Each part of the primitives counts for itself, so more parts than workers only cost memory and scanning.
-    parts = min(4 * device.units if device.kind == "cpu" else 64 * device.units, -(-count // 256),
-                max(1, (256 << 20) // (4 * bins)))
+    parts = max(1, min(4 * device.units, -(-count // 4096)))
     chunk = -(-count // parts)
+    counts = scratch.array("depth_counts", (parts, DEPTH_BUCKETS), np.uint32)
+    totals = scratch.array("depth_totals", (DEPTH_BUCKETS,), np.uint32)
+    offsets = scratch.array("depth_offsets", (DEPTH_BUCKETS + 1,), np.uint32)
+    order = scratch.array("order", (count,), np.uint32)
+    device.kernel("render/count_depths.cl")((parts,), None, footprints.full, footprints.buckets, count, chunk,
+                                            DEPTH_BUCKETS, counts)
+    scan(device, counts, parts, DEPTH_BUCKETS, totals, offsets)
+    device.kernel("render/order_depths.cl")((parts,), None, footprints.full, footprints.buckets, count, chunk,
+                                            DEPTH_BUCKETS, counts, offsets, order)
+    return order, offsets
+
+
+def scan(device: Device, counts: DeviceArray, parts: int, bins: int, totals: DeviceArray, offsets: DeviceArray) -> None:
+    """Turn counts (parts, bins) into offsets within each bin, and write the bins' own offsets (bins + 1,)."""
+    device.kernel("render/scan_bins.cl")((bins,), (64,), counts, parts, bins, totals)
+    device.kernel("render/scan_totals.cl", constants={"GROUP": 64})((64,), (64,), totals, bins, offsets)
+
+
+def bin_pairs(device: Device, scratch: "Scratch", grid: Grid, footprints: Footprints, count: int) -> PairLists | None:
+    """Order by depth, count, scan and fill the pairs of `count` primitives; None where nothing touches the picture."""
+    bins = grid.bin_count
+    order, depth_offsets = order_depths(device, scratch, footprints, count)
+    # Each part of the primitives counts for itself, so more parts than workers only cost memory and scanning.
+    parts = max(1, min(4 * device.units if device.kind == "cpu" else 64 * device.units, -(-count // 256),
+                       (256 << 20) // (4 * bins)))
     device.check_memory(bin_counts=4 * bins * parts, bin_offsets=8 * (bins + 1))
     counts = scratch.array("bin_counts", (parts, bins), np.uint32)
-    totals = scratch.array("bin_totals", (bins,), np.uint32)
-    device.kernel("render/count_bins.cl")((parts,), None, full, keys, count, chunk, grid.bins_x, bins, counts)
-    device.kernel("render/scan_bins.cl")((bins,), (64,), counts, parts, bins, totals)
-    host_offsets = np.zeros(bins + 1, np.uint64)
-    np.cumsum(device.download(totals, copy=False), out=host_offsets[1:])
-    total = int(host_offsets[-1])
+    offsets = scratch.array("bin_offsets", (bins + 1,), np.uint32)
+    device.kernel("render/count_bins.cl")((parts,), None, order, depth_offsets, footprints.full, footprints.keys, parts,
+                                          grid.bins_x, bins, counts)
+    scan(device, counts, parts, bins, scratch.array("bin_totals", (bins,), np.uint32), offsets)
+    total = int(device.download(offsets, copy=False)[-1])
     if total == 0:
         return None
-    device.check_memory(pairs=8 * total, sorted_pairs=8 * total)
-    offsets = scratch.array("bin_offsets", (bins + 1,), np.uint32)
-    device.write(offsets, host_offsets.astype(np.uint32))
+    device.check_memory(pairs=8 * total)
     pairs = scratch.array("pairs", (total, 2), np.uint32)
-    ordered = scratch.array("sorted_pairs", (total, 2), np.uint32)
-    device.kernel("render/fill_bins.cl")((parts,), None, full, core, keys, count, chunk, grid.bins_x, bins, counts,
-                                         offsets, pairs)
-    device.kernel("render/sort_bins.cl", constants={"VW": lanes})((bins,), (16,), pairs, offsets, bins, ordered)
-    return PairLists(offsets, ordered, total)
+    device.kernel("render/fill_bins.cl")((parts,), None, order, depth_offsets, footprints.full, footprints.core,
+                                         footprints.keys, parts, grid.bins_x, bins, counts, offsets, pairs)
+    return PairLists(offsets, pairs, total)
 
 
 class Scratch:

@@ -5,6 +5,7 @@
 // edge-on that is much less. A piece that reaches the eye's plane may appear anywhere, so it gets the whole picture.
 #include "common/slim.clh"
 #include "common/select_slim.clh"
+#include "common/bins.clh"
 
 #ifndef ALPHA
 #define ALPHA 0.8f  // pass 1 draws balls shrunk by this
@@ -15,6 +16,7 @@
 
 INLINE VF lesser(VF a, VF b) { return VMIN(a, b); }
 INLINE VF greater(VF a, VF b) { return VMAX(a, b); }
+INLINE VF magnitude(VF x) { return VMAX(x, -x); }
 INLINE VF root_of(VF x) { return VSQRT(VMAX(x, (VF)(0.0f))); }
 
 // Extent [lo, hi] along a direction m, m2 = |m|^2 and mn = m . n, of the disc times [low, high] inside a ball of `radius`.
@@ -41,7 +43,8 @@ INLINE void block_range(VF lo, VF hi, float size, VI *first, VI *last) {
 __kernel void project_slim(__global const float *view, __global const float *surfels, int stride, int count,
                            __global const uchar *flags, __global const uint *footprint,
                            __global const uchar *visited, int visited_end,
-                           __global float *records, __global short4 *full, __global short4 *core, __global uint *keys) {
+                           __global float *records, __global short4 *full, __global short4 *core, __global uint *keys,
+                           __global ushort *buckets) {
   int first = get_global_id(0) * VW;
   if (first >= count) return;
   int lanes = count - first < VW ? count - first : VW;
@@ -124,13 +127,28 @@ __kernel void project_slim(__global const float *view, __global const float *sur
     block_range(lo_x, hi_x, view[WIDTH], &block[4 * pass], &block[4 * pass + 2]);
     block_range(lo_y, hi_y, view[HEIGHT], &block[4 * pass + 1], &block[4 * pass + 3]);
   }
-  // Which sides can be seen: the gradient leaves the normal by at most `slope`, the ray its middle by r / depth.
-  VF d2 = 1.0f + dX * dX + dY * dY;
-  VF slack = slope * root_of(d2 - nd * nd) + (perspective ? r * inv_t * (1.0f + slope) : (VF)(0.0f));
-  VI enters = (nd - slack < 0.0f) | crosses, leaves = (nd + slack > 0.0f) | crosses;
+  // Which sides can be seen: over the unit disc f' along the ray of the centre is its value there plus a linear form
+  // (and for degree 3 a bounded rest); the ray's own direction changes by up to r / depth.
+  __global const VF *k = plane + COEFFICIENTS * step;
+  VF ud = uX * dX + uY * dY - uZ, vd = vX * dX + vY * dY - vZ, at_centre = nd, spread = 0.0f;
+#if DEGREE >= 2
+  VF su = k[3 * step] * ud + k[4 * step] * vd, sv = k[4 * step] * ud + k[5 * step] * vd;
+  at_centre -= k[step] * ud + k[2 * step] * vd;
+  spread = 2.0f * root_of(su * su + sv * sv);
+#endif
+#if DEGREE >= 3
+  VF cu = 3.0f * (k[6 * step] * ud) + k[7 * step] * vd, cm = k[7 * step] * ud + k[8 * step] * vd;
+  VF cv = k[8 * step] * ud + 3.0f * (k[9 * step] * vd);
+  spread += magnitude(cu) + magnitude(cm) + magnitude(cv);
+#endif
+  if (perspective) spread += r * inv_t * (1.0f + slope);
+  VI enters = (at_centre - spread < 0.0f) | crosses, leaves = (at_centre + spread > 0.0f) | crosses;
   VU bits = AS_VU(near);
   VU ordered = bits ^ SEL((VU)(0x80000000u), (VU)(0xffffffffu), AS_VI(bits) < 0);
   ordered = (ordered & 0xffffff00u) | AS_VU(SEL((VI)(0), (VI)(1), enters) | SEL((VI)(0), (VI)(2), leaves));
+  VF bucket = (near - view[FIRST_DEPTH]) * (1.0f / view[BUCKET_DEPTH]);
+  bucket = lesser(greater(bucket, (VF)(0.0f)), (VF)(DEPTH_BUCKETS - 1));
+  VI bucket_number = TO_VI(bucket);
   VF off = t_ref - depth;
 
   VF px = unit / fx, py = -unit / fy;
@@ -143,7 +161,6 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   field[RADIUS] = r; field[RADIUS_PX] = perspective ? r * inv_t : r;
   field[BIAS] = BACK_BIAS * r; field[REACH] = r + off;
   field[FOOT_LO] = 0.0f; field[FOOT_HI] = 0.0f;
-  __global const VF *k = plane + COEFFICIENTS * step;
   field[K0] = k[0];
 #if DEGREE >= 2
   for (int i = 1; i < 6; i++) field[K0 + i] = k[i * step];
@@ -152,6 +169,7 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   for (int i = 6; i < 10; i++) field[K6 + i - 6] = k[i * step];
 #endif
   const int *box = (const int *)block, *show = (const int *)&visible;
+  const int *bucket_of = (const int *)&bucket_number;
   const uint *key = (const uint *)&ordered;
   for (int i = 0; i < lanes; i++) {
     int at = first + i;
@@ -163,6 +181,7 @@ __kernel void project_slim(__global const float *view, __global const float *sur
     full[at] = blocks;
     core[at] = (short4)(box[4 * VW + i], box[5 * VW + i], box[6 * VW + i], box[7 * VW + i]);
     keys[at] = key[i];
+    buckets[at] = (ushort)bucket_of[i];
     __global float *record = records + (size_t)at * RECORD_FLOATS;
     for (int f = 0; f < RECORD_FLOATS; f++) record[f] = lane[f * VW + i];
     record[FOOT_LO] = as_float(footprint[2 * at]);

@@ -47,13 +47,39 @@ INLINE VI inside_footprint(uint lo, uint hi, VF u, VF v) {
        & (-v <= (float)(hi >> 16 & 255u) * unit) & (-b <= (float)(hi >> 24) * unit);
 }
 
-// Pass 1: depth of the frontmost hit behind `low` and in front of `z` (in), its side (1, -1) and surfel.
-INLINE void frontmost(__global const uint2 *pairs, int count, uint block, __global const float *records, VF px, VF py,
-                      VF low, VF *z, VF *hit, VF *facing, VI *nearest, int *cost) {
+#if VW == 1
+#define PAIRS __global const uint2 *
+#define SKIP(pair, bits) if (!((pair).y & (bits))) continue;
+#else
+// The pairs of one block, a segment of the bin's list at a time: what remains has no unpredictable branch.
+#define PAIRS const uint2 *
+#define SKIP(pair, bits)
+#define SEGMENT 256
+INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *kept) {
+  int n = 0;
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
-    if (!(pair.y & block)) continue;
-    if (!any_lane(near_of_key(pair.y) < *z)) continue;
+    kept[n] = pair;
+    n += pair.y >> shift & 1u;
+  }
+  return n;
+}
+#endif
+
+// Pass 1: depth of the frontmost hit behind `low` and in front of `z` (in), its side (1, -1) and surfel. Returns whether
+// pairs further back may still matter.
+INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global const float *records, VF px, VF py,
+                     VF low, VF *z, VF *hit, VF *facing, VI *nearest, int *cost) {
+  int more = 1;
+  for (int e = 0; e < count; e++) {
+    uint2 pair = pairs[e];
+    SKIP(pair, block)
+    float near = near_of_key(pair.y);
+    if (!any_lane(near < *z)) {
+      // Pairs behind are at most a bucket nearer; PoCL is slower with a break.
+      if (!any_lane(near - bucket < *z)) { count = 0; more = 0; }
+      continue;
+    }
     __global const float *k = records + (size_t)(pair.x & ~FROM_BEHIND) * RECORD_FLOATS;
     float side = pair.x & FROM_BEHIND ? -1.0f : 1.0f;
     VF x = px - k[XR], y = py - k[YR], s, slope;
@@ -76,57 +102,65 @@ INLINE void frontmost(__global const uint2 *pairs, int count, uint block, __glob
 #endif
     *cost += 1;
   }
+  return more;
 }
 
-// Pass 2: blend the surfels whose ball holds the point at depth `hit` (INFINITY: no point).
-INLINE Blend blended(__global const uint2 *pairs, int count, uint block, __global const float *records,
-                     __global const float4 *colors, VF px, VF py, VF hit, VF facing, int *cost) {
-  Blend sum;
-  sum.depth = 0.0f; sum.weight = 0.0f; sum.fx = 0.0f; sum.fy = 0.0f; sum.ft = 0.0f;
-  sum.red = 0.0f; sum.green = 0.0f; sum.blue = 0.0f; sum.nearest = 0; sum.number = 0;
+// Pass 2: add the surfels whose ball holds the point at depth `hit` (INFINITY: no point); all points lie in [least, most].
+INLINE void blend(PAIRS pairs, int count, uint block, __global const float *records, __global const float4 *colors,
+                  VF px, VF py, VF hit, float least, float most, VF facing, Blend *sum, int *cost) {
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
-    if (!(pair.y & block)) continue;
+    SKIP(pair, block)
     uint index = pair.x & ~FROM_BEHIND;
     __global const float *k = records + (size_t)index * RECORD_FLOATS;
+    if (k[T_REF] - k[REACH] > most || k[T_REF] + k[REACH] < least) continue;
     float side = pair.x & FROM_BEHIND ? -1.0f : 1.0f;
     VF s = hit - k[T_REF];
-    VI inside = (s < k[REACH]) & (s > -k[REACH]);
-    if (ORIENTED) inside = inside & (facing == side);
-    if (!any_lane(inside)) continue;
     VF x = px - k[XR], y = py - k[YR], step, slope;
     VF u = k[U0] + k[UX] * x + k[UY] * y, v = k[V0] + k[VX] * x + k[VY] * y, w = k[W0] + k[WX] * x + k[WY] * y;
     VF du = k[DU] + k[INV_T] * u, dv = k[DV] + k[INV_T] * v, dw = k[DW] + k[INV_T] * w;
     u += s * du; v += s * dv; w += s * dw;
-    inside = inside & (u * u + v * v + w * w < 1.0f);
+    VI inside = u * u + v * v + w * w < 1.0f;
+    if (ORIENTED) inside = inside & (facing == side);
     if (!any_lane(inside)) continue;
     RayPoly p = ray_poly(k, u, v, w, du, dv, dw);
     inside = inside & ray_root(p, side, &step, &slope);
+    step = SEL((VF)(0.0f), step, inside);  // no NaN may reach the sums
     u += step * du; v += step * dv; w += step * dw;
     VF g = 1.0f - (u * u + v * v + w * w), gu, gv;
     inside = inside & (g > 0.0f);
     VF weight = SEL((VF)(0.0f), g * g * g, inside);
     height_slope(k, u, v, &gu, &gv);
     VF tilt = weight * (side * k[RADIUS_PX]);
-    sum.weight += weight;
-    sum.depth += weight * SEL((VF)(0.0f), step, inside);
-    sum.fx += tilt * (k[WX] - gu * k[UX] - gv * k[VX]);
-    sum.fy += tilt * (k[WY] - gu * k[UY] - gv * k[VY]);
-    sum.ft -= weight * k[RADIUS] * SEL((VF)(0.0f), slope, inside);
+    sum->weight += weight;
+    sum->depth += weight * step;
+    sum->fx += tilt * (k[WX] - gu * k[UX] - gv * k[VX]);
+    sum->fy += tilt * (k[WY] - gu * k[UY] - gv * k[VY]);
+    sum->ft -= weight * k[RADIUS] * SEL((VF)(0.0f), slope, inside);
 #if HAS_COLOR
     float4 color = colors[index];
-    sum.red += weight * color.x; sum.green += weight * color.y; sum.blue += weight * color.z;
+    sum->red += weight * color.x; sum->green += weight * color.y; sum->blue += weight * color.z;
 #endif
 #if FIELD_COUNT >= 0
-    sum.number += SEL((VI)(0), (VI)(1), inside);
+    sum->number += SEL((VI)(0), (VI)(1), inside);
 #endif
     *cost += 1;
   }
-  return sum;
+}
+
+// Least and largest of the finite lanes; there is one.
+INLINE void range_of(VF hit, float *least, float *most) {
+  VF finite = SEL(hit, (VF)(-INFINITY), hit == INFINITY);
+  const float *a = (const float *)&hit, *b = (const float *)&finite;
+  *least = a[0]; *most = b[0];
+  for (int i = 1; i < VW; i++) {
+    *least = a[i] < *least ? a[i] : *least;
+    *most = b[i] > *most ? b[i] : *most;
+  }
 }
 
 // One block (VW = 1: one pixel) of a bin.
-INLINE int draw_block(__global const float *view, __global const uint2 *pairs, int count, uint block,
+INLINE int draw_block(__global const float *view, __global const uint2 *pairs, int count, uint quarter,
                       __global const float *records, __global const float4 *colors, __global const int *levels,
                       __global float *planes, int was_touched, int surface, VI lane_x, VI lane_y, int bin_x, int bin_y,
                       int at) {
@@ -143,10 +177,31 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   for (int attempt = 0; attempt < TRIES; attempt++) {
     VF z = SEL(-infinite, before, active), hit = infinite, facing = 0.0f;
     VI nearest = 0;
-    frontmost(pairs, count, block << 4, records, px, py, low, &z, &hit, &facing, &nearest, &cost);
+#if VW == 1
+    frontmost(pairs, count, 16u << quarter, view[BUCKET_DEPTH], records, px, py, low, &z, &hit, &facing, &nearest, &cost);
+#else
+    uint2 kept[SEGMENT];
+    int more = 1;
+    for (int first = 0; first < count && more; first += SEGMENT) {
+      int n = filtered(pairs + first, count - first < SEGMENT ? count - first : SEGMENT, quarter + 4, kept);
+      more = frontmost(kept, n, 0u, view[BUCKET_DEPTH], records, px, py, low, &z, &hit, &facing, &nearest, &cost);
+    }
+#endif
     VI found = hit < infinite;
     if (!any_lane(found)) break;
-    Blend sum = blended(pairs, count, block, records, colors, px, py, hit, facing, &cost);
+    float least, most;
+    range_of(hit, &least, &most);
+    Blend sum;
+    sum.depth = sum.weight = sum.fx = sum.fy = sum.ft = sum.red = sum.green = sum.blue = 0.0f;
+    sum.nearest = 0; sum.number = 0;
+#if VW == 1
+    blend(pairs, count, 1u << quarter, records, colors, px, py, hit, least, most, facing, &sum, &cost);
+#else
+    for (int first = 0; first < count; first += SEGMENT) {
+      int n = filtered(pairs + first, count - first < SEGMENT ? count - first : SEGMENT, quarter, kept);
+      blend(kept, n, 0u, records, colors, px, py, hit, least, most, facing, &sum, &cost);
+    }
+#endif
     found = found & (sum.weight > 0.0f);
     sum.depth = hit + sum.depth / sum.weight;
 #define KEEP(x) best.x = SEL(best.x, sum.x, found)
@@ -211,8 +266,8 @@ __kernel void tile_slim(__global const float *view, __global const uint2 *pairs,
     __global float *planes = tile_planes + (size_t)bin * BIN_PIXELS * FIELDS;
     int was_touched = touched[bin] >= 0;
 #if VW == 1
-    uint block = 1u << ((pixel & 7) >> 2 | (pixel >> 5) << 1);
-    int mine = draw_block(view, pairs + begin, count, block, records, colors, levels, planes, was_touched, surface,
+    uint quarter = (pixel & 7) >> 2 | (pixel >> 5) << 1;
+    int mine = draw_block(view, pairs + begin, count, quarter, records, colors, levels, planes, was_touched, surface,
                           LANE_X(pixel), LANE_Y(pixel), bin_x, bin_y, pixel);
     barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     if (pixel == 0) cost = was_touched ? touched[bin] : 0;
@@ -225,7 +280,7 @@ __kernel void tile_slim(__global const float *view, __global const uint2 *pairs,
     for (int b = 0; b < 64 / VW; b++) {
       int quarter = b / (16 / VW), part = b % (16 / VW);
       int qx = (quarter & 1) * 4, qy = (quarter >> 1) * 4 + part * (VW / 4);
-      cost += draw_block(view, pairs + begin, count, 1u << quarter, records, colors, levels, planes, was_touched, surface,
+      cost += draw_block(view, pairs + begin, count, (uint)quarter, records, colors, levels, planes, was_touched, surface,
                          qx + LANE_X(0), qy + LANE_Y(0), bin_x, bin_y, qy * BIN + qx);
     }
     touched[bin] = (was_touched ? touched[bin] : 0) + cost * VW;
