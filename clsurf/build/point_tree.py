@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..device import Device
 from ..device.arrays import DeviceArray
 
+FAR_POINT = 1e6  # coordinate of the points that pad the last block (gather_points.cl)
 BLOCK = 16  # points of a block, children of a node
 
 
@@ -24,8 +25,8 @@ class PointTree:
         Index of every sorted point in the input.
     codes : (count,) uint64
         Morton codes, `bits` an axis, ascending.
-    sorted : DeviceArray (6, padded) float32
-        x, y, z, normal x, y, z.
+    sorted : DeviceArray (6 or 7, padded) float32
+        x, y, z, normal x, y, z, and weights where given.
     boxes, node_offset : DeviceArray
         See kernels/build/point_tree.clh.
     top_level : int
@@ -51,6 +52,11 @@ class PointTree:
         """The kernel arguments of a ball query: padded, sorted, boxes, node_offset, top_level."""
         return self.padded, self.sorted, self.boxes, self.node_offset, self.top_level
 
+    @property
+    def weighted(self) -> bool:
+        """Whether the points have weights."""
+        return self.sorted.shape[0] == 7
+
     def cells(self, width: float) -> list[tuple[DeviceArray, DeviceArray]]:
         """Return first and last + 1 point of the occupied cells at least `width` wide, one pair of arrays per colour.
 
@@ -69,7 +75,8 @@ class PointTree:
         return self.cells_of_step[step]
 
 
-def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: float, device: Device) -> PointTree:
+def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: float, device: Device,
+                     weights: NDArray | None = None) -> PointTree:
     """Sort points along the Morton curve of their box and build the tree over them.
 
     Parameters
@@ -83,13 +90,21 @@ def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: 
     count = len(points)
     order, codes, grid = morton_order(points, device)
     padded = -(-count // BLOCK) * BLOCK
-    out = device.empty((6, padded), np.float32)
+    out = device.empty((6 if weights is None else 7, padded), np.float32)
     device.kernel("build/gather_points.cl")((padded,), (64,), count, padded, device.upload(points),
                                            device.upload(normals), device.upload(order), *map(float, middle),
                                            float(scale), out)
+    if weights is not None:
+        device.kernel("build/gather_weights.cl")((padded,), (64,), count, padded, device.upload(weights),
+                                                device.upload(order), out)
     boxes, node_offset, top_level = build_boxes(out, padded, device)
     return PointTree(device, count, padded, order, codes, grid[0], out, boxes, node_offset, top_level,
                      grid[1] / scale)
+
+
+def column_bounds(points: NDArray) -> NDArray:
+    """Return the lowest and highest (2, 3) of points (n, 3): columns one by one, six times as fast as along axis 0."""
+    return np.array([[points[:, k].min() for k in range(3)], [points[:, k].max() for k in range(3)]])
 
 
 def morton_order(points: NDArray, device: Device) -> tuple[NDArray, NDArray, tuple[int, float]]:
@@ -106,7 +121,7 @@ def morton_order(points: NDArray, device: Device) -> tuple[NDArray, NDArray, tup
     count = len(points)
     index_bits = max(1, (count - 1).bit_length())
     bits = min(16, (64 - index_bits) // 3)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = column_bounds(points)
     width = max(float((high - low).max()), float(np.finfo(np.float32).tiny))
     cells_per_length = (1 << bits) / (width * (1 + 1e-6))
     codes = device.empty(count, np.uint64)

@@ -10,7 +10,7 @@ from ..device.arrays import DeviceArray
 from ..errors import InputError
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface, frame_of_normals
-from .point_tree import BLOCK, build_boxes, morton_order
+from .point_tree import BLOCK, build_boxes, column_bounds, morton_order
 
 LEAF = 24  # floats a leaf (project_points.cl)
 FAR = 1e6  # centre of the balls that pad the last block
@@ -103,13 +103,20 @@ def project(surface, points, device=None) -> Projection:
                       out[6] * tree.unit)
 
 
-def leaf_tree(surface: SlimSurface, device: Device) -> LeafTree:
-    """Put the leaves of `surface` on `device`, sorted along the Morton curve, in coordinates of its diagonal."""
+def leaf_tree(surface: SlimSurface, device: Device, middle: NDArray | None = None) -> LeafTree:
+    """Put the leaves of `surface` on `device`, sorted along the Morton curve, in coordinates (x - middle) / diagonal.
+
+    Parameters
+    ----------
+    middle : (3,) float64, optional
+        Relative to the surface's origin; the middle of the leaves where not given.
+    """
     leaf = np.flatnonzero(surface.leaf)
     if len(leaf) == 0:
         raise InputError("surface: expected at least one leaf, got none")
     centers = surface.centers[leaf]
-    middle = (centers.min(axis=0) / 2 + centers.max(axis=0) / 2).astype(np.float64)
+    if middle is None:
+        middle = (column_bounds(centers) / 2).sum(axis=0, dtype=np.float64)
     unit = surface.diagonal
     order, _, _ = morton_order(centers, device)
     leaf = leaf[order]

@@ -1,12 +1,13 @@
 """What sets a surfel's radius: the diagonal, lambda of paper 003 (equation 3), and the golden-ratio segments."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from .point_tree import BLOCK, PointTree
+from .point_tree import BLOCK, PointTree, column_bounds
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 FIRST_RADIUS = 0.1  # r_0 over the diagonal (paper, section 2)
@@ -28,7 +29,7 @@ def robust_box(points: NDArray) -> NDArray:
     sample = points[:: max(1, len(points) // 20_000)]
     keep = points
     for _ in range(8):
-        box = np.stack([keep.min(axis=0), keep.max(axis=0)]).astype(np.float64)
+        box = column_bounds(keep).astype(np.float64)
         if len(points) < 1000:
             return box
         middle = np.quantile(sample, (0.001, 0.999), axis=0)
@@ -44,25 +45,50 @@ def robust_box(points: NDArray) -> NDArray:
         if inside.all() or not inside.any():
             return box
         keep = keep[inside]
-    return np.stack([keep.min(axis=0), keep.max(axis=0)]).astype(np.float64)
+    return column_bounds(keep).astype(np.float64)
 
 
-def noise_lambda(tree: PointTree) -> float:
-    """Return lambda: the mean over sampled points of the smallest covariance eigenvalue of their neighbourhoods.
+@dataclass(frozen=True)
+class Noise:
+    """What the neighbourhoods of a scan say about it, over the diagonal (variance: squared).
 
-    Ten nearest neighbours, exact; in units of the diagonal squared.
+    Attributes
+    ----------
+    variance : float
+        lambda of the paper: the mean smallest eigenvalue of the covariance of ten neighbours.
+    spacing : float
+        Distance between neighbours of an even grid with the median density.
     """
+
+    variance: float
+    spacing: float
+
+
+def measure_noise(tree: PointTree) -> Noise:
+    """Return lambda and the point spacing from a sample of at least 20 thousand points, ten exact neighbours each."""
     blocks = tree.padded // BLOCK
     wanted = min(blocks, -(-SAMPLES // BLOCK))
     # Evenly spread blocks of the Morton order are spread over the surface.
     chosen = (np.arange(wanted) * blocks // wanted).astype(np.int32)
     neighbors = min(10, tree.count - 1)
     if neighbors < 3:
-        return 0.0
+        return Noise(0.0, 1.0)
     device = tree.device
-    spread = device.empty((wanted, BLOCK), np.float32)
+    spread, furthest2 = device.empty((wanted, BLOCK), np.float32), device.empty((wanted, BLOCK), np.float32)
     kernel = device.kernel("build/neighbor_spread.cl", constants={"NEIGHBORS": neighbors})
     start_reach = 2.0 / math.sqrt(tree.count)
-    kernel((wanted,), (1,), wanted, device.upload(chosen), *tree.arguments, start_reach, spread)
-    values = device.download(spread, copy=False).ravel()
-    return float(values[values >= 0].astype(np.float64).mean())
+    kernel((wanted,), (1,), wanted, device.upload(chosen), *tree.arguments, start_reach, spread, furthest2)
+    values = device.download(spread, copy=False)
+    real = values >= 0
+    median2 = float(np.median(device.download(furthest2, copy=False)[real]))
+    return Noise(float(values[real].astype(np.float64).mean()), math.sqrt(median2 * math.pi / (neighbors + 0.5)))
+
+
+def automatic_error(noise: Noise) -> float:
+    """Return T_MDL for a scan of this noise: 3.5 point spacings.
+
+    lambda already follows the noise, so that the penalty lambda T^2 / r^2 has the form of the noise that a fit of
+    radius r leaves, sigma^2 (terms / points in the ball): T is a multiple of the spacing. 3.5 was the best for noisy
+    scans (vertices projected onto the surface against the clean mesh).
+    """
+    return float(np.clip(3.5 * noise.spacing, 1e-4, 0.05))

@@ -16,6 +16,12 @@
 #define NORMAL_SHARE 0.618034f // of r_r: the ball whose mean normal sets the frame
 #define RECORD 16 // floats out: radius, normal, e, leaf, coefficients from 6
 
+#ifdef WEIGHTED
+#define TIMES_WEIGHT(g, i, p) g *= ((const float *)ball->k)[16 * (i) + (p)];
+#else
+#define TIMES_WEIGHT(g, i, p)
+#endif
+
 inline VF weight_of(float d2, VF inverse_r2) {
   VF g = 1.0f - d2 * inverse_r2;
   g = SEL(g, (VF)0.0f, g < 0.0f);
@@ -73,6 +79,7 @@ inline void sum_moments(const Ball *ball, const Frame *frame, float inverse_r, V
     for (int p = 0; p < points; ++p) {
       VF g = weight_of(c.d2.s[p], inverse_r2);
       n -= g > 0.0f;
+      TIMES_WEIGHT(g, i, p)
       ADD_SUMS
     }
   }
@@ -89,6 +96,7 @@ inline VF mean_residual2(const Ball *ball, const Frame *frame, float inverse_r, 
     int points = IN_CHUNK(ball->count, i);
     for (int p = 0; p < points; ++p) {
       VF g = weight_of(k.d2.s[p], inverse_r2);
+      TIMES_WEIGHT(g, i, p)
       VF f = k.w.s[p] - height_at(c, k.u.s[p], k.v.s[p]);
       sum += g * f * f;
       total += g;
@@ -132,7 +140,7 @@ inline void fit_polynomials(const VF *moment, const VF *right, VF r, VF *c) {
         local_chunk(&c, block[0] - x, block[padded / 16] - y, block[2 * (size_t)(padded / 16)] - z, frame, inverse_r); \
         float16 g = 1.0f - c.d2.v;                                                                                \
         g = SEL(g, (float16)0.0f, g < 0.0f);                                                                      \
-        g = g * g * g;                                                                                            \
+        g = POINT_WEIGHT(g * g * g, block, (size_t)(padded / 16));                                                \
         body                                                                                                      \
       }                                                                                                           \
   }

@@ -1,5 +1,6 @@
 // Smallest eigenvalue of the covariance of a point and its NEIGHBORS nearest neighbours; one work-item per block of 16
-// points, one query per lane, exact. The mean over many points is the lambda of paper 003, equation 3.
+// points, one query per lane, exact; and the squared distance of the furthest of them. The mean eigenvalue over many
+// points is the lambda of paper 003, equation 3.
 #include "common/lanes.clh"
 #include "build/point_tree.clh"
 
@@ -33,7 +34,7 @@ inline float smallest_eigenvalue(float xx, float yy, float zz, float xy, float x
 
 __kernel void neighbor_spread(int queries, __global const int *block, int padded, __global const float *sorted,
                               __global const float *boxes, __global const int *node_offset, int top_level,
-                              float start_reach, __global float *spread) {
+                              float start_reach, __global float *spread, __global float *furthest2) {
   int q = get_global_id(0);
   if (q >= queries) return;
   __global const float *px = sorted, *py = sorted + padded, *pz = sorted + 2 * (size_t)padded;
@@ -74,6 +75,7 @@ __kernel void neighbor_spread(int queries, __global const int *block, int padded
     margin = worst < 1e9f ? sqrt(worst) * 1.0001f : 2.0f * margin;
   }
   VF n = 0.0f, sx = 0.0f, sy = 0.0f, sz = 0.0f, xx = 0.0f, yy = 0.0f, zz = 0.0f, xy = 0.0f, xz = 0.0f, yz = 0.0f;
+  ((__global VF *)furthest2)[q] = best[NEIGHBORS];
   VF kth = best[NEIGHBORS] * 1.00001f;
   BROADCAST_BLOCKS(VF in = SEL((VF)0.0f, (VF)1.0f, d2 <= kth); n += in; dx *= in; dy *= in; dz *= in; sx += dx; sy += dy;
                    sz += dz; xx += dx * dx; yy += dy * dy; zz += dz * dz; xy += dx * dy; xz += dx * dz; yz += dy * dz;)
