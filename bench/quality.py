@@ -92,8 +92,8 @@ def measure(truth: Truth, depth: NDArray, normal: NDArray | None, diagonal: floa
         The counts of `COUNTS` (pixels; fragments: components), ``depth_median`` and ``depth_rms`` in % of the
         diagonal (the median over all pixels hit by both, the root mean square without the outliers),
         ``distance_median`` (the depth error times the cosine between viewing axis and normal: how far the surfaces
-        are apart, % of the diagonal), ``normals_missing`` (pixels with a depth and no finite normal), and ``normal_median`` and
-        ``normal_facet_median`` in degrees: against the mesh's interpolated normals and those of its triangles.
+        are apart, % of the diagonal), ``normals_missing`` (pixels with a depth and no finite normal), ``normal_median``
+        and ``normal_facet_median`` in degrees: against the mesh's interpolated normals and those of its triangles.
     """
     found = masks(truth, depth, diagonal)
     figures = {name: int(np.count_nonzero(found[name])) for name in COUNTS}

@@ -9,8 +9,9 @@ import numpy as np
 
 from clsurf.errors import InputError
 from clsurf.io.scans import load_scan
+from clsurf.surface.mesh import Mesh
 
-from .truth import mesh_key
+from .truth import mesh_key, vertex_normals
 
 FILES = {"bunny": "bunny/bunny.obj", "dragon": "dragon/dragon.ply", "fandisk": "denoise/Fandisk0.3/Original.obj"}
 
@@ -45,21 +46,20 @@ def data_folder() -> Path:
 
 def available(name: str) -> bool:
     """Return whether the scan `name` can be loaded here."""
-    return name == "demo" or (data_folder() / FILES[name]).exists()
+    return name == "generated" or (data_folder() / FILES[name]).exists()
 
 
 @functools.lru_cache(maxsize=8)
 def scene(name: str) -> Scene:
-    """Return the scene "bunny", "dragon", "fandisk" or "demo" (generated).
+    """Return the scene "bunny", "dragon", "fandisk" or "generated".
 
     Raises
     ------
     InputError
         The scan's file is missing.
     """
-    if name == "demo":
-        from clsurf.models import demo_scan
-        return Scene(name, demo_scan())
+    if name == "generated":
+        return Scene(name, wavy_torus())
     path = data_folder() / FILES[name]
     if not path.exists():
         raise InputError(f"scene {name}: expected the scan {FILES[name]} in the folder that CLSURF_DATA names, found "
@@ -67,13 +67,29 @@ def scene(name: str) -> Scene:
     return Scene(name, load_scan(path))
 
 
+def wavy_torus(around: int = 400, across: int = 150) -> Mesh:
+    """Return a closed mesh of about 60,000 vertices with ripples of two sizes: the scene where there is no data.
+
+    It has faces, which the exact pictures need; the generated scans of `clsurf.models` are points.
+    """
+    t, s = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(across) * 2 * np.pi / across, indexing="ij")
+    radius = 0.4 + 0.03 * np.sin(9 * t + 2 * s) + 0.01 * np.sin(31 * t - 8 * s)
+    ring = 1 + radius * np.cos(s)
+    points = np.stack([ring * np.sin(t), radius * np.sin(s), ring * np.cos(t)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    here, on = i * across + j, (i + 1) % around * across + j
+    up, both = i * across + (j + 1) % across, (i + 1) % around * across + (j + 1) % across
+    faces = np.stack([here, on, both, here, both, up], axis=-1).reshape(-1, 3)
+    return Mesh(points, faces, normals=vertex_normals(points, faces))
+
+
 def chosen(names, quick: bool) -> list[str]:
     """Return the names that can be measured here; without their data, say so in one line and take the generated one."""
     if quick:
-        return ["demo"]
+        return ["generated"]
     found = [name for name in names if available(name)]
     missing = [name for name in names if name not in found]
     if missing:
         print(f"scans missing: {', '.join(missing)} (CLSURF_DATA names their folder)"
               + ("; a generated one is measured instead" if not found else ""))
-    return found or ["demo"]
+    return found or ["generated"]

@@ -41,17 +41,18 @@ class Case:
 CASES = (Case("bunny 500", "bunny", size=(500, 500)), Case("dragon 1024", "dragon"),
          Case("dragon 1024 cubic", "dragon", degree=3), Case("dragon 1024 fast (8 px)", "dragon", lod=8.0),
          Case("dragon 100 px high", "dragon", height_px=100.0))
-QUICK_CASES = (Case("demo 500", "demo", size=(500, 500)), Case("demo 500 cubic", "demo", degree=3, size=(500, 500)))
+QUICK_CASES = (Case("generated 500", "generated", size=(500, 500)),
+               Case("generated 500 cubic", "generated", degree=3, size=(500, 500)))
 # Faults are counted for these; (scene, degree, lod in pixels).
 PICTURES = (("bunny", 2, 4.0), ("dragon", 2, 4.0), ("bunny", 3, 4.0), ("dragon", 3, 4.0), ("dragon", 2, 8.0))
-QUICK_PICTURES = (("demo", 2, 4.0),)
+QUICK_PICTURES = (("generated", 2, 4.0),)
 
 
 def measure(device, quick: bool = False, profile: bool = False) -> dict:
     """Return the figures of rendering; `device` is an opened one."""
     names = scenes.chosen(("bunny", "dragon"), quick)
-    cases = QUICK_CASES if names == ["demo"] else [case for case in CASES if case.scene in names]
-    pictures = QUICK_PICTURES if names == ["demo"] else [p for p in PICTURES if p[0] in names]
+    cases = QUICK_CASES if names == ["generated"] else [case for case in CASES if case.scene in names]
+    pictures = QUICK_PICTURES if names == ["generated"] else [p for p in PICTURES if p[0] in names]
     wanted = dict.fromkeys([(c.scene, c.degree) for c in cases] + [p[:2] for p in pictures])
     surfaces = {key: built(scenes.scene(key[0]), key[1], device) for key in wanted}
     figures = {"pictures": {}, "frames": {}}
