@@ -292,6 +292,23 @@ def _check_k(k) -> None:
         raise InputError(f"k: expected 1 to {LARGEST_K} neighbours, got {k}")
 
 
+def sampled_covariance(points, k, samples, device=None) -> Covariance:
+    """Return `covariance` at no fewer than `samples` of the points themselves, or at all where there are fewer.
+
+    They are taken in whole leaves, spread evenly along the curve, which costs a fraction of scattered queries.
+    """
+    tree = points if isinstance(points, BoxTree) else box_tree(points, device)
+    step = len(tree) // max(samples, WIDTH)
+    if step < 2:
+        return covariance(tree, k)
+    whole = np.arange(0, len(tree) // WIDTH, step)
+    count = WIDTH * len(whole)
+    blocks = tree.device.upload(tree.device.download(tree.leaves, copy=False)[whole])
+    asked = _Queries(blocks, tree.device.upload(np.arange(count, dtype=np.uint32)),
+                     tree.device.upload(whole.astype(np.uint32)), count)
+    return _covariance(tree, asked, k)
+
+
 def noise_level(points, k=10, samples=20000, device=None) -> float:
     """Return the mean smallest eigenvalue of the covariance of k nearest points: lambda of the SLIM paper, section 2.
 
@@ -299,15 +316,6 @@ def noise_level(points, k=10, samples=20000, device=None) -> float:
     ----------
     points : (n, 3) array_like or BoxTree
     samples : int
-        At least this many points are looked at, in whole leaves spread evenly along the curve; all where there are
-        fewer.
+        At least this many points are looked at, where there are as many.
     """
-    tree = points if isinstance(points, BoxTree) else box_tree(points, device)
-    step = max(1, len(tree) // max(samples, 1))
-    if step == 1:
-        return float(covariance(tree, k).eigenvalues[:, 0].mean(dtype=np.float64))
-    whole = np.arange(0, len(tree) // WIDTH, step)
-    blocks = tree.device.upload(tree.device.download(tree.leaves, copy=False)[whole])
-    asked = _Queries(blocks, tree.device.upload(np.arange(WIDTH * len(whole), dtype=np.uint32)),
-                     tree.device.upload(whole.astype(np.uint32)), WIDTH * len(whole))
-    return float(_covariance(tree, asked, k).eigenvalues[:, 0].mean(dtype=np.float64))
+    return float(sampled_covariance(points, k, samples, device).eigenvalues[:, 0].mean(dtype=np.float64))

@@ -8,15 +8,17 @@ from numpy.typing import NDArray
 from ..device import open_device
 from ..errors import Cancelled, InputError
 from ..surface.cloud import PointCloud
-from .neighbours import box_tree, covariance
+from .neighbours import LARGEST_K, box_tree, covariance, sampled_covariance
 from .orientation import oriented_to, signs_of, voxel_means
 
 ORIENTS = ("auto", "scanners", "graph", "up")
 LIDAR_ATTRIBUTES = {"classification", "return_number", "number_of_returns", "scan_angle", "scan_angle_rank"}
+NOISY = 0.38  # see _suitable_k
+VOXEL = 6.0  # over the k-th distance / sqrt(k): about 3.4 point spacings, 1.5 times the 16th distance
 FLAT = 0.3  # height over extent below which a lidar cloud is seen from above
 
 
-def estimate_normals(cloud: PointCloud, k=16, orient="auto", progress=None, device=None) -> PointCloud:
+def estimate_normals(cloud: PointCloud, k="auto", orient="auto", progress=None, device=None) -> PointCloud:
     """Return `cloud` with unit normals estimated from the k nearest distinct points of each, and oriented.
 
     The normal is the direction in which the k nearest points (the point itself counted) spread least.
@@ -25,8 +27,9 @@ def estimate_normals(cloud: PointCloud, k=16, orient="auto", progress=None, devi
     ----------
     cloud : PointCloud
         Points, finite; their order, colours and attributes are kept, normals already there are replaced.
-    k : int
-        Neighbours, 3 to 128; all points where there are fewer.
+    k : int or "auto"
+        Neighbours, 3 to 128; all points where there are fewer. "auto": 16, or 48 where the noise of neighbouring
+        points is as large as their spacing.
     orient : str, (3,) array_like or None
         "scanners": toward `cloud.scanners`. "up": +z. "graph": consistent between neighbours and outward. A (3,)
         position in world space: toward that viewpoint. None: signs without meaning. "auto": "scanners" where they are
@@ -50,19 +53,21 @@ def estimate_normals(cloud: PointCloud, k=16, orient="auto", progress=None, devi
         `progress` returned False.
     """
     orient = _checked_orient(cloud, orient)
-    if k < 3:
-        raise InputError(f"k: expected at least 3 neighbours for a normal, got {k}")
+    if k != "auto" and not 3 <= k <= LARGEST_K:
+        raise InputError(f"k: expected 'auto' or 3 to {LARGEST_K} neighbours, got {k!r}")
     if len(cloud.points) == 0:
         return dataclasses.replace(cloud, normals=np.zeros((0, 3), np.float32))
     device = open_device(device)
     report = lambda share: _report(progress, share)  # noqa: E731
     report(0.0)
     points, inverse = distinct(cloud.points)
-    found = covariance(box_tree(points, device), k)
+    tree = box_tree(points, device)
+    k = _suitable_k(tree) if k == "auto" else k
+    found = covariance(tree, k)
     report(0.3)
     normals = found.normals.copy()
     if isinstance(orient, str) and orient == "graph":
-        _orient_by_graph(points, normals, found.reach, device)
+        _orient_by_graph(points, normals, VOXEL * float(np.median(found.reach)) / np.sqrt(k), device)
     if inverse is not None:
         normals = normals[inverse]
     if isinstance(orient, str) and orient == "scanners":
@@ -118,8 +123,22 @@ def distinct(points) -> tuple[NDArray, NDArray | None]:
     return (kept, inverse.ravel()) if len(kept) < len(points) else (points, None)
 
 
-def _orient_by_graph(points, normals, reach, device) -> None:
-    """Orient `normals` (n, 3) in place through voxels of 1.5 times the median distance to the k-th neighbour."""
-    voxel, means, axes = voxel_means(points, normals, 1.5 * float(np.median(reach)))
-    axes *= signs_of(means, axes, 8, device)[:, None]
+def _suitable_k(tree) -> int:
+    """Return 16, or 48 where 16 points spread across the surface nearly as much as along it.
+
+    The median ratio of the two spreads is 0.03-0.13 on clean scans, 0.2-0.34 on scans with noise added for tests of
+    smoothing, and 0.45 on 15 raw range images laid over each other, where 48 instead of 16 neighbours halve the wrong
+    signs.
+    """
+    spread = sampled_covariance(tree, 16, 5000).eigenvalues
+    ratio = np.sqrt(np.median(spread[:, 0] / np.maximum(spread[:, 1], np.finfo(np.float32).tiny)))
+    return 48 if ratio > NOISY else 16
+
+
+def _orient_by_graph(points, normals, size, device) -> None:
+    """Orient `normals` (n, 3) in place through voxels of side `size`."""
+    if not size > 0:
+        return  # all points at one place
+    voxel, means, axes = voxel_means(points, normals, size)
+    axes *= signs_of(means, axes, size, device=device)[:, None]
     oriented_to(normals, axes[voxel])

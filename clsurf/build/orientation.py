@@ -1,11 +1,17 @@
 """Consistent orientation of estimated normals.
 
-Neighbouring normals n and m at offset direction e should satisfy n.m - 2 (n.e)(m.e) > 0: the second is the mirror
-image of the first about the plane between the points, as on any osculating sphere. The signs that satisfy most of
-these signed weights are found by contraction: every part joins the neighbour to which its summed signed weight is
-largest, flipped where the sum is negative, and the weights between the joined parts are summed anew, so that many weak
-votes outweigh one bad edge. (A spanning tree, which follows single edges, is as good on clean meshes, but had 9-23 % of
-the signs wrong on raw range scans.)
+Neighbouring normals n and m at offset direction e should agree in what they have perpendicular to e: n.m - (n.e)(m.e)
+above 0. Two sheets that face each other say nothing about each other this way, be they the sides of a thin plate or
+two scans of one surface that do not quite meet. (With the usual mirror term, -2 (n.e)(m.e), raw range scans came out
+1.6 % wrong instead of 1.0 %.)
+
+The signs that satisfy most of these signed weights are found by contraction: every part joins the neighbour to which
+its summed signed weight is largest, flipped where the sum is negative, and the weights between the joined parts are
+summed anew, so that many weak votes outweigh one bad edge. (A spanning tree, which follows single edges, is as good on
+clean meshes, but had 9-23 % of the signs wrong on raw range scans.)
+
+The outside takes part as one more node: a normal that is seen from 26 directions around should face them. These votes
+are weak against neighbours but add up over large parts; without them 2-20 % came out wrong now and then, in one piece.
 
 Scans are averaged in voxels above their noise first; the points take the sign of their voxel.
 """
@@ -13,11 +19,15 @@ Scans are averaged in voxels above their noise first; the points take the sign o
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse import csgraph
 
 from .neighbours import nearest
 
-NEIGHBOURS = 12  # edges of the graph per node, before it is made symmetric
+NEIGHBOURS = 8  # nearest voxels that every voxel is compared with; 12 gained nothing
+# Weight of what the outside sees against the neighbours. 2 to 20 were measured: raw scans 1.07, 1.02 (5), 1.00 (10),
+# 1.4 % wrong; the dragon does not care.
+OUTSIDE = 10.0
+PIXEL = 2.0  # of the pictures of the outside, over the voxel: surfaces are opaque in them
+CLEAR = 0.1  # share of votes below which the outside has not decided
 
 
 def oriented_to(normals, directions) -> NDArray:
@@ -27,7 +37,7 @@ def oriented_to(normals, directions) -> NDArray:
     return normals
 
 
-def signs_of(points, normals, neighbours=NEIGHBOURS, device=None) -> NDArray:
+def signs_of(points, normals, spacing, neighbours=NEIGHBOURS, device=None) -> NDArray:
     """Return the sign (n,) float32 of every normal that makes them consistent and outward.
 
     Parameters
@@ -35,6 +45,8 @@ def signs_of(points, normals, neighbours=NEIGHBOURS, device=None) -> NDArray:
     points : (n, 3) float32
     normals : (n, 3) float32
         Unit normals of unknown sign.
+    spacing : float
+        Distance between neighbouring points, about.
     neighbours : int
         Nearest points that every point is compared with.
     """
@@ -42,8 +54,60 @@ def signs_of(points, normals, neighbours=NEIGHBOURS, device=None) -> NDArray:
     if count < 2:
         return np.ones(count, np.float32)
     weights = signed_graph(points, normals, neighbours, device)
-    signs, part = contracted(weights)
-    return signs * outward(points, normals * signs[:, None], part)[part]
+    votes, seen = seen_from_outside(points, normals, PIXEL * spacing)
+    signs, part = contracted(with_outside(weights, OUTSIDE * votes))
+    signs, part = signs[:-1] * signs[-1], part[:-1]
+    parts = part.max() + 1
+    decided = np.bincount(part, signs * votes, parts) > CLEAR * np.bincount(part, seen, parts)
+    return signs * np.where(decided, 1, outward(points, normals * signs[:, None], part))[part].astype(np.float32)
+
+
+def view_directions() -> NDArray:
+    """Return the unit directions (26, 3) to the corners, edges and faces of a cube; with every one its opposite."""
+    steps = np.mgrid[-1:2, -1:2, -1:2].reshape(3, -1).T.astype(np.float32)
+    steps = steps[np.any(steps != 0, axis=1)]
+    return steps / np.linalg.norm(steps, axis=1, keepdims=True)
+
+
+def seen_from_outside(points, normals, pixel) -> tuple[NDArray, NDArray]:
+    """Return how far every normal faces the directions that see its point, and how much it is seen, (n,) float32 each.
+
+    A direction sees the points that are less than one pixel behind the nearest one in their pixel. A sheet seen from
+    both sides gets no vote, because the views come in opposite pairs.
+
+    Parameters
+    ----------
+    pixel : float
+        Side of a pixel; it should be wide enough for neighbouring points to hide what is behind them.
+    """
+    votes, seen = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    directions = view_directions()
+    for direction in directions:
+        side = np.cross(direction, np.eye(3, dtype=np.float32)[np.argmin(np.abs(direction))])
+        side /= np.linalg.norm(side)
+        x, y = points @ side, points @ np.cross(direction, side)
+        column = ((x - x.min()) / pixel).astype(np.int64)
+        row = ((y - y.min()) / pixel).astype(np.int64)
+        _, key = np.unique(column * (row.max() + 1) + row, return_inverse=True)
+        depth = points @ direction
+        front = np.full(key.max() + 1, -np.inf, np.float32)
+        np.maximum.at(front, key, depth)
+        visible = depth > front[key] - pixel
+        facing = np.where(visible, normals @ direction, 0)
+        votes += facing
+        seen += np.abs(facing)
+    votes[np.abs(votes) < 1e-4] = 0  # cancelled up to rounding
+    return votes / len(directions), seen / len(directions)
+
+
+def with_outside(weights, votes) -> sparse.csr_array:
+    """Return the graph (n, n) with one more node, joined to every node by its vote (n,)."""
+    graph = sparse.coo_array(weights)
+    count = len(votes)
+    nodes, last = np.arange(count), np.full(count, count)
+    return sparse.csr_array((np.concatenate([graph.data, votes, votes]),
+                             (np.concatenate([graph.row, nodes, last]), np.concatenate([graph.col, last, nodes]))),
+                            shape=(count + 1, count + 1))
 
 
 def signed_graph(points, normals, neighbours, device=None) -> sparse.csr_array:
@@ -56,7 +120,7 @@ def signed_graph(points, normals, neighbours, device=None) -> sparse.csr_array:
     rows, columns, distance = rows[keep], columns[keep], distance[keep]
     edge = (points[columns] - points[rows]) / np.maximum(distance, 1e-37)[:, None]
     n, m = normals[rows], normals[columns]
-    dot = np.einsum("ij,ij->i", n, m) - 2 * np.einsum("ij,ij->i", n, edge) * np.einsum("ij,ij->i", m, edge)
+    dot = np.einsum("ij,ij->i", n, m) - np.einsum("ij,ij->i", n, edge) * np.einsum("ij,ij->i", m, edge)
     weights = sparse.csr_array((dot.astype(np.float64), (rows, columns)), shape=(count, count))
     return (weights + weights.T).tocsr()
 
@@ -172,7 +236,3 @@ def voxel_means(points, normals, size) -> tuple[NDArray, NDArray, NDArray]:
     axes = np.linalg.eigh(tensor)[1][:, :, 2].astype(np.float32)
     return voxel, means, np.ascontiguousarray(axes)
 
-
-def parts_of(weights) -> NDArray:
-    """Return the connected part (n,) of every node."""
-    return csgraph.connected_components(weights, directed=False)[1]
