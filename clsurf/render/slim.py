@@ -20,7 +20,7 @@ PLANES = 21  # kernels/common/select_slim.clh: 11 + up to 10 coefficients
 COEFFICIENT_PLANE = 11
 IS_LEAF, IS_ROOT = 1, 2
 INTERNAL_SCALE = 1.5  # internal surfels are not alpha-covered: drawn at their own radius they leave holes
-LARGEST_COUNT = 1 << 28
+LARGEST_COUNT = 1 << 30  # an index leaves two bits of a pair
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,8 +159,8 @@ def bin_pairs(device: Device, scratch: "Scratch", grid: Grid, footprints: Footpr
     device.check_memory(bin_counts=4 * bins * parts, bin_offsets=8 * (bins + 1))
     counts = scratch.array("bin_counts", (parts, bins), np.uint32)
     offsets = scratch.array("bin_offsets", (bins + 1,), np.uint32)
-    device.kernel("render/count_bins.cl")((parts,), None, order, depth_offsets, footprints.full, footprints.keys, parts,
-                                          grid.bins_x, bins, counts)
+    device.kernel("render/count_bins.cl")((parts,), None, order, depth_offsets, footprints.full, parts, grid.bins_x, bins,
+                                          counts)
     scan(device, counts, parts, bins, scratch.array("bin_totals", (bins,), np.uint32), offsets)
     total = int(device.download(offsets, copy=False)[-1])
     if total == 0:

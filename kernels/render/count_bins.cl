@@ -3,16 +3,14 @@
 #include "common/bins.clh"
 
 __kernel void count_bins(__global const uint *order, __global const uint *depth_offsets, __global const short4 *full,
-                         __global const uint *keys, int parts, int bins_x, int bin_count, __global uint *counts) {
+                         int parts, int bins_x, int bin_count, __global uint *counts) {
   int part = get_global_id(0), count = depth_offsets[DEPTH_BUCKETS], chunk = (count + parts - 1) / parts;
   int begin = part * chunk, end = begin + chunk < count ? begin + chunk : count;
   __global uint *mine = counts + (size_t)part * bin_count;
   for (int i = 0; i < bin_count; i++) mine[i] = 0;
   for (int i = begin; i < end; i++) {
     short4 r = full[order[i]];
-    uint sides = keys[order[i]] & 3u;
-    sides = (sides & 1u) + (sides >> 1);
     for (int y = r.y >> 1; y <= r.w >> 1; y++)
-      for (int x = r.x >> 1; x <= r.z >> 1; x++) mine[y * bins_x + x] += sides;
+      for (int x = r.x >> 1; x <= r.z >> 1; x++) mine[y * bins_x + x]++;
   }
 }

@@ -11,15 +11,12 @@ __kernel void fill_bins(__global const uint *order, __global const uint *depth_o
   for (int i = begin; i < end; i++) {
     uint index = order[i];
     short4 r = full[index], c = core[index];
-    uint key = keys[index] & 0xffffff00u, sides = keys[index] & 3u;
+    uint key = keys[index] & 0xffffff00u;
+    index |= (keys[index] & 3u) << 30;
     for (int y = r.y >> 1; y <= r.w >> 1; y++)
       for (int x = r.x >> 1; x <= r.z >> 1; x++) {
         int bin = y * bins_x + x;
-        uint at = offsets[bin] + mine[bin];
-        uint bits = key | block_bits(c, x, y) << 4 | block_bits(r, x, y);
-        if (sides & 1u) pairs[at++] = (uint2)(index, bits);
-        if (sides & 2u) pairs[at++] = (uint2)(index | FROM_BEHIND, bits);
-        mine[bin] = at - offsets[bin];
+        pairs[offsets[bin] + mine[bin]++] = (uint2)(index, key | block_bits(c, x, y) << 4 | block_bits(r, x, y));
       }
   }
 }

@@ -26,6 +26,15 @@ enum { HEADLIGHT, DIRECTIONAL, POINT };
 
 #define NONE as_float(0x7fc00000)
 
+// Fill `count` floats with one value.
+inline void fill(__global float *out, int count, float value) {
+  int i = 0;
+  float4 four = value;
+  for (; i < count && ((size_t)(out + i) & 15); i++) out[i] = value;
+  for (; i + 4 <= count; i += 4) STREAM((__global float4 *)(out + i), four);
+  for (; i < count; i++) out[i] = value;
+}
+
 // x^n for a whole n; native_powr is a call per lane on PoCL.
 inline VF whole_power(VF x, int n) {
   VF y = 1.0f;
@@ -154,7 +163,8 @@ inline void shade_run(__global const float *view, __global const float *shading,
   for (int c = 0; c < 3; c++) rgb[c] = SEL((VF)(shading[BACKGROUND + c]), rgb[c], hit);
   VF alpha = SEL((VF)(shading[BACKGROUND + 3]), (VF)(1.0f), hit);
   for (int i = 0; i < lanes; i++)
-    color[at + i] = (float4)(((float *)&rgb[0])[i], ((float *)&rgb[1])[i], ((float *)&rgb[2])[i], ((float *)&alpha)[i]);
+    STREAM(color + at + i, (float4)(((float *)&rgb[0])[i], ((float *)&rgb[1])[i], ((float *)&rgb[2])[i],
+                                    ((float *)&alpha)[i]));
 #endif
 }
 
@@ -166,16 +176,16 @@ inline void background_run(__global const float *shading, int width, int x, int 
   size_t at = (size_t)y * width + x;
 #if WRITE_COLOR
   float4 back = (float4)(shading[BACKGROUND], shading[BACKGROUND + 1], shading[BACKGROUND + 2], shading[BACKGROUND + 3]);
-  for (int i = 0; i < pixels; i++) color[at + i] = back;
+  for (int i = 0; i < pixels; i++) STREAM(color + at + i, back);
 #endif
 #if WRITE_DEPTH
-  for (int i = 0; i < pixels; i++) depth[at + i] = NONE;
+  fill(depth + at, pixels, NONE);
 #endif
 #if WRITE_NORMAL
-  for (int i = 0; i < 3 * pixels; i++) normal[3 * at + i] = NONE;
+  fill(normal + 3 * at, 3 * pixels, NONE);
 #endif
 #if WRITE_POSITION
-  for (int i = 0; i < 3 * pixels; i++) position[3 * at + i] = NONE;
+  fill(position + 3 * at, 3 * pixels, NONE);
 #endif
 #if FIELD_ID >= 0
   for (int i = 0; i < pixels; i++) id[at + i] = -1;
