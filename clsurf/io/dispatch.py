@@ -1,0 +1,81 @@
+"""One name for reading any file and one for writing: the ending decides."""
+
+from pathlib import Path
+
+from clsurf.errors import InputError
+from clsurf.surface.cloud import PointCloud
+from clsurf.surface.mesh import Mesh
+from clsurf.surface.slim import SlimSurface
+
+from . import scans
+
+SURFACES = (".clsurf", ".slim2t")
+
+
+def load(path):
+    """Read a scan or a surface.
+
+    Parameters
+    ----------
+    path : path-like
+        A scan (.ply .obj .stl .off .glb .gltf .xyz .txt .asc .pts .csv .npy .npz .las .laz), cleaned as `clean_scan`
+        does, or what `save` wrote: .clsurf, .slim2t.
+
+    Returns
+    -------
+    Mesh, PointCloud or SlimSurface
+
+    Raises
+    ------
+    InputError
+        No such file, or an unknown ending.
+    FileFormatError
+        An empty, truncated, damaged or foreign file.
+    """
+    ending = _ending(path)
+    if ending == ".clsurf":
+        from .store import load_store
+        return load_store(path)
+    if ending == ".slim2t":
+        from .slim2t import load_slim2t
+        return load_slim2t(path)
+    if ending not in scans.READS:
+        raise InputError(f"{path}: unknown format {ending or '(no ending)'}: expected one of "
+                         f"{' '.join((*scans.READS, *SURFACES))}")
+    return scans.load_scan(path)
+
+
+def save(thing, path) -> None:
+    """Write a scan or a surface in the format of the ending; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    thing : Mesh, PointCloud or surface
+    path : path-like
+        .clsurf for anything, .slim2t for a SlimSurface, and for scans what `load` reads, except .gltf.
+
+    Raises
+    ------
+    InputError
+        An unknown ending, one that does not fit the kind of `thing`, or a place that cannot be written.
+    """
+    ending = _ending(path)
+    if ending == ".clsurf":
+        from .store import save_store
+        save_store(thing, path)
+    elif ending == ".slim2t" and isinstance(thing, SlimSurface):
+        from .slim2t import save_slim2t
+        save_slim2t(thing, path)
+    elif ending in scans.WRITES and isinstance(thing, Mesh | PointCloud):
+        scans.save_scan(thing, path)
+    else:
+        allowed = (*scans.WRITES, ".clsurf") if isinstance(thing, Mesh | PointCloud) else SURFACES
+        raise InputError(f"{path}: a {type(thing).__name__} cannot be written as {ending or '(no ending)'}: expected "
+                         f"one of {' '.join(allowed)}")
+
+
+def _ending(path) -> str:
+    try:
+        return Path(path).suffix.lower()
+    except TypeError:
+        raise InputError(f"path: expected a file name, got {type(path).__name__}") from None

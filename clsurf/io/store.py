@@ -1,0 +1,184 @@
+"""The .clsurf store: a Zarr v3 group of plain arrays in a zip file or a folder.
+
+Attributes of the group: `format` "clsurf", `version`, `kind` ("slim", "mesh", "points") and `values`, the numbers and
+flags. Arrays are named as the fields of the data types, chunked by rows and compressed losslessly (zstd with bit
+shuffling). Any Zarr library reads them.
+"""
+
+import math
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, BytesCodec
+from zarr.storage import LocalStore, ZipStore
+
+from clsurf.errors import Error, FileFormatError, InputError
+
+from .files import existing_file, one_line, replacing
+from .layout import KINDS, from_arrays, to_arrays
+
+VERSION = 1
+_CHUNK_BYTES = 1 << 21  # of one chunk: parts can be read remotely, yet a surface has few files
+_LARGEST_CHUNK = 1 << 30  # that is read
+_MOST_COMPRESSED = 20_000  # array bytes per stored byte: zstd on a constant chunk of 2 MB reaches 10,000
+_BLOSC_HEADER = 16
+
+
+def save_store(thing, path) -> None:
+    """Write a surface or scan as a .clsurf zip; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        Something that is neither, or a place that cannot be written.
+    """
+    kind, arrays, values = to_arrays(thing)
+    attributes = {"format": "clsurf", "version": VERSION, "kind": kind, "values": values}
+    with replacing(path) as temporary:
+        store = ZipStore(temporary, mode="w")
+        try:
+            # Attributes are given here: a later update would put a second zarr.json into the zip.
+            group = zarr.create_group(store, attributes=attributes)
+            for name, array in arrays.items():
+                _create(group, name, array)
+        finally:
+            store.close()
+
+
+def _create(group: zarr.Group, name: str, array) -> None:
+    array = np.ascontiguousarray(array)
+    row_bytes = max(1, array.dtype.itemsize * math.prod(array.shape[1:]))
+    rows = min(max(1, _CHUNK_BYTES // row_bytes), max(1, array.shape[0] if array.ndim else 1))
+    shuffled = BloscCodec(typesize=array.dtype.itemsize, cname="zstd", clevel=5, shuffle="bitshuffle")
+    # Chunks of zeros are written too: a missing chunk is then always a damaged store.
+    group.create_array(name, data=array, chunks=(rows, *(max(1, n) for n in array.shape[1:])), compressors=shuffled,
+                       serializer=BytesCodec(endian="little"), filters=None, config={"write_empty_chunks": True})
+
+
+def load_store(path):
+    """Read a surface or scan from a .clsurf zip or folder.
+
+    Raises
+    ------
+    InputError
+        No such file.
+    FileFormatError
+        Not such a store, damaged, truncated, or written by a newer version of the format.
+    """
+    folder = Path(path)
+    members: _Members
+    if folder.is_dir():
+        members, path = _FolderMembers(folder), folder
+    else:
+        path = existing_file(path)
+        members = _zip_members(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            store = LocalStore(path, read_only=True) if path.is_dir() else ZipStore(path, mode="r")
+            try:
+                return _read_group(path, zarr.open_group(store, mode="r", zarr_format=3), members)
+            finally:
+                store.close()
+    except Error:
+        raise
+    except MemoryError:
+        raise FileFormatError(f"{path}: too large for this machine's memory, or damaged") from None
+    except Exception as error:  # zarr, its codecs and the data types raise anything for a damaged store
+        raise FileFormatError(f"{path}: damaged .clsurf store: {one_line(error)}") from error
+    finally:
+        members.close()
+
+
+def _read_group(path: Path, group: zarr.Group, members: "_Members"):
+    about = dict(group.attrs)
+    if about.get("format") != "clsurf":
+        raise FileFormatError(f"{path}: a Zarr group, but not a clsurf store (its format is {about.get('format')!r})")
+    version, kind = about.get("version"), about.get("kind")
+    if not isinstance(version, int) or version < 1:
+        raise FileFormatError(f"{path}: damaged: expected a version number, got {version!r}")
+    if version > VERSION:
+        raise FileFormatError(f"{path}: written in version {version} of the .clsurf format, this clsurf reads up to "
+                              f"version {VERSION}: install a newer clsurf")
+    if kind not in KINDS:
+        raise FileFormatError(f"{path}: holds the unknown kind {kind!r}: expected {', '.join(KINDS)}")
+    found = {name: item for name, item in group.members(max_depth=2) if isinstance(item, zarr.Array)}
+    for name, array in found.items():
+        _check_array(path, name, array, members)
+    return from_arrays(kind, {name: np.asarray(array[...]) for name, array in found.items()}, dict(about["values"]))
+
+
+def _check_array(path: Path, name: str, array: zarr.Array, members: "_Members") -> None:
+    """Refuse an array whose chunks are missing or cannot hold what it declares, before memory is taken."""
+    codecs = array.metadata.codecs
+    plain = array.dtype.kind in "biuf" and all(isinstance(codec, BytesCodec | BloscCodec) for codec in codecs)
+    if not plain or len(codecs) != 2:
+        raise FileFormatError(f"{path}: {name}: unexpected type {array.dtype} or encoding {codecs!r}")
+    chunk_bytes = array.dtype.itemsize * math.prod(array.chunks)
+    count = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True))
+    prefix = f"{name}/c/" if array.shape else f"{name}/c"
+    chunks = [key for key in members.sizes if key.startswith(prefix)]
+    stored = sum(members.sizes[key] for key in chunks)
+    if len(chunks) != count:
+        raise FileFormatError(f"{path}: {name}: expected {count:,} chunks, got {len(chunks):,}: truncated or damaged")
+    if chunk_bytes > _LARGEST_CHUNK or array.nbytes > _MOST_COMPRESSED * (stored + 4096):
+        raise FileFormatError(f"{path}: {name}: shape {array.shape} does not fit in {stored:,} stored bytes: damaged")
+    for key in chunks:
+        head = members.head(key)
+        if len(head) < _BLOSC_HEADER or int.from_bytes(head[4:8], "little") != chunk_bytes or (
+                int.from_bytes(head[12:16], "little") != members.sizes[key]):
+            raise FileFormatError(f"{path}: {name}: damaged chunk {key}")
+
+
+class _Members:
+    """Sizes of the files in a store by name, and their first bytes."""
+
+    sizes: dict[str, int]
+
+    def head(self, key: str) -> bytes:
+        raise InputError(f"no such member {key}")
+
+    def close(self) -> None:
+        pass
+
+
+class _ZipMembers(_Members):
+    def __init__(self, path: Path):
+        self._zip = zipfile.ZipFile(path)
+        self.sizes = {item.filename: item.file_size for item in self._zip.infolist()}
+
+    def head(self, key: str) -> bytes:
+        with self._zip.open(key) as file:
+            return file.read(_BLOSC_HEADER)
+
+    def close(self) -> None:
+        self._zip.close()
+
+
+class _FolderMembers(_Members):
+    def __init__(self, path: Path):
+        self._path = path
+        self.sizes = {p.relative_to(path).as_posix(): p.stat().st_size for p in path.rglob("*") if p.is_file()}
+        if "zarr.json" not in self.sizes:
+            raise FileFormatError(f"{path}: a folder, but not a .clsurf store: it has no zarr.json")
+
+    def head(self, key: str) -> bytes:
+        with open(self._path / key, "rb") as file:
+            return file.read(_BLOSC_HEADER)
+
+
+def _zip_members(path: Path) -> _Members:
+    size = path.stat().st_size
+    try:
+        members = _ZipMembers(path)
+    except Exception as error:  # zipfile raises more than BadZipFile on garbage
+        raise FileFormatError(f"{path}: not a .clsurf store (a zip file): {one_line(error)}: truncated?") from None
+    total = sum(members.sizes.values())
+    if total > 4 * size + 4096 or "zarr.json" not in members.sizes:
+        members.close()
+        raise FileFormatError(f"{path}: a zip file, but not a .clsurf store" if "zarr.json" not in members.sizes else
+                              f"{path}: damaged: {total:,} bytes claimed in a file of {size:,}")
+    return members
