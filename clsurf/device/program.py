@@ -14,7 +14,8 @@ from ..errors import KernelBuildError
 from .arrays import DeviceArray
 from .sources import argument_dtypes, kernel_text
 
-BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable"]
+# -w: PoCL prints its compiler's warnings straight to the terminal.
+BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable", "-w"]
 
 
 class Kernel:
