@@ -10,6 +10,7 @@ from clsurf.surface.mesh import Mesh
 
 log = logging.getLogger("clsurf")
 
+MIX = np.uint64(0x9E3779B97F4A7C15)  # odd, its bits look random: 2^64 over the golden ratio
 _UNIT = 1e-4  # normals whose length is off by more are normalised; less is the rounding of text and 16-bit formats
 
 
@@ -144,7 +145,7 @@ def first_of_duplicates(keys: NDArray) -> tuple[NDArray, NDArray]:
     hashes = np.zeros(count, np.uint64)
     for column in range(bits.shape[1]):
         hashes ^= bits[:, column]
-        hashes *= np.uint64(0x9E3779B97F4A7C15)
+        hashes *= MIX
         hashes ^= hashes >> np.uint64(29)
     ordered = np.sort(hashes)
     if not (ordered[1:] == ordered[:-1]).any():

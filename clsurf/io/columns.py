@@ -15,6 +15,7 @@ from clsurf.errors import FileFormatError
 from clsurf.surface.cloud import PointCloud
 
 from .colors import as_rgba8
+from .rows import digits_of, world_of, write_rows
 
 _NAMES = {"x": "x", "easting": "x", "east": "x", "y": "y", "northing": "y", "north": "y", "z": "z", "elevation": "z",
           "height": "z", "nx": "nx", "normalx": "nx", "ny": "ny", "normaly": "ny", "nz": "nz", "normalz": "nz",
@@ -47,7 +48,7 @@ def read_text(path: Path) -> PointCloud:
     body = data[start:]
     if separator == ";" and b"," in body[:_HEAD]:
         body = body.replace(b",", b".")
-    table = _parse(path, body, separator, names)
+    table = _parse(path, body, separator, names, counted=count is not None)
     if count is not None and len(table) < count:
         raise FileFormatError(f"{path}: truncated: its first line counts {count:,} points, got {len(table):,}")
     return cloud_of_table(path, table, names)
@@ -83,7 +84,7 @@ def _look(path, data: bytes) -> tuple[int, str | None, list[str] | None, int | N
     raise FileFormatError(f"{path}: no line of numbers")
 
 
-def _parse(path, body: bytes, separator, names) -> NDArray:
+def _parse(path, body: bytes, separator, names, counted: bool) -> NDArray:
     """Return the table (n, columns) float64; columns that hold words are NaN."""
     first = body[:body.find(b"\n") if b"\n" in body else len(body)].decode("utf-8", "replace")
     words = [w.strip() for w in (first.split(separator) if separator else first.split())]
@@ -100,19 +101,19 @@ def _parse(path, body: bytes, separator, names) -> NDArray:
         try:
             table = np.loadtxt(io.BytesIO(body), usecols=numbers, **options)
         except (ValueError, IndexError, OverflowError):
-            table = _parse_slowly(path, body, separator, numbers)
+            table = _parse_slowly(path, body, separator, numbers, counted)
     out = np.full((len(table), len(words)), np.nan)
     out[:, numbers] = table
     return out
 
 
-def _parse_slowly(path, body: bytes, separator, numbers) -> NDArray:
-    """Return the same for tables with empty fields (NaN), counts between blocks, or a bad line, which is named."""
+def _parse_slowly(path, body: bytes, separator, numbers, counted: bool) -> NDArray:
+    """Return the same for tables with empty fields (NaN), counts between the blocks, or a bad line, which is named."""
     rows = []
     for line in body.decode("utf-8", "replace").splitlines():
         line = re.split(r"#|//|%|!", line, maxsplit=1)[0].strip()
         words = [w.strip() for w in (line.split(separator) if separator else line.split())]
-        if not line or (len(words) == 1 and words[0].isdigit()):
+        if not line or (counted and len(words) == 1 and words[0].isdigit()):
             continue
         try:
             rows.append([float(words[i]) if words[i] else np.nan for i in numbers])
@@ -135,7 +136,8 @@ def cloud_of_table(path, table: NDArray, names: list[str] | None = None) -> Poin
     names = _guess(table) if names is None else [_NAMES.get(_plain(n), n) for n in names[:table.shape[1]]]
     columns: dict[str, NDArray] = {}
     for name, column in zip(names, table.T, strict=False):
-        columns.setdefault(name, column)
+        if name:
+            columns.setdefault(name, column)
     columns = {n: c for n, c in columns.items() if n in "xyz" or not np.isnan(c).all()}
     if not {"x", "y", "z"} <= set(columns):
         raise FileFormatError(f"{path}: expected the columns x, y, z, got {', '.join(columns)}")
@@ -196,9 +198,8 @@ def write_text(scan, path: Path) -> None:
     The first line names the columns (.pts: counts the points, then always x y z intensity, and r g b with colours).
     """
     ending = path.suffix.lower()
-    world = scan.points + scan.origin if scan.origin.any() else scan.points
-    digits = "%.15g" if scan.origin.any() else "%.9g"
-    parts = [(list("xyz"), world, digits)]
+    world = world_of(scan)
+    parts = [(list("xyz"), world, digits_of(scan))]
     attributes = {n: np.asarray(a) for n, a in scan.attributes.items() if np.ndim(a) == 1 and len(n.split()) == 1}
     colors = None if scan.colors is None else scan.colors if (scan.colors[:, 3] < 255).any() else scan.colors[:, :3]
     if ending == ".pts":
@@ -214,9 +215,6 @@ def write_text(scan, path: Path) -> None:
     separator = "," if ending == ".csv" else " "
     names = [name for part in parts for name in part[0]]
     header = f"{len(world)}" if ending == ".pts" else ("" if ending == ".csv" else "# ") + separator.join(names)
-    line = separator.join(separator.join([form] * len(part)) for part, _, form in parts) + "\n"
     with open(path, "w", encoding="utf-8", newline="\n") as file:
         file.write(header + "\n")
-        for at in range(0, len(world), 65536):
-            rows = np.concatenate([np.asarray(v[at:at + 65536], np.float64) for _, v, _ in parts], axis=1)
-            file.write((line * len(rows)) % tuple(rows.ravel().tolist()))
+        write_rows(file, [(values, form) for _, values, form in parts], separator=separator)

@@ -1,4 +1,4 @@
-"""OBJ, STL, OFF, GLB and glTF: read through trimesh, and written."""
+"""OBJ, STL, GLB and glTF: read through trimesh, and written."""
 
 import contextlib
 import json
@@ -17,10 +17,10 @@ from clsurf.surface.mesh import Mesh
 
 from .colors import as_rgba8
 from .images import read_image, write_image
+from .rows import BLOCK, digits_of, world_of, write_rows
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _NO_PICTURE = (2, 2)  # what trimesh puts where a material names no picture
-_BLOCK = 65536  # rows of text formatted at once
 
 
 def read_mesh(path: Path) -> Mesh | PointCloud:
@@ -46,12 +46,12 @@ def read_mesh(path: Path) -> Mesh | PointCloud:
         options["maintain_order"] = b"\nvt" not in data
     with _quiet():
         loaded = trimesh.load(str(path), process=False, **options)
-    parts = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
+    parts = _placed_parts(loaded)
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if len(meshes) > 1:
-        meshes = [trimesh.util.concatenate(meshes)]
-    if meshes:
+    if len(meshes) == 1:
         return _mesh_of(meshes[0], path)
+    if meshes:
+        return _mesh_of(trimesh.util.concatenate(meshes), path)
     clouds = [part for part in parts if len(getattr(part, "vertices", ())) and part.vertices.shape[1] == 3]
     if not clouds:
         raise FileFormatError(f"{path}: holds no vertices")
@@ -59,6 +59,32 @@ def read_mesh(path: Path) -> Mesh | PointCloud:
     colors = [np.asarray(getattr(part, "colors", ())) for part in clouds]
     whole = all(c.ndim == 2 and len(c) == len(p.vertices) for c, p in zip(colors, clouds, strict=True))
     return PointCloud(points, colors=as_rgba8(np.concatenate(colors)) if whole else None)
+
+
+def _placed_parts(loaded) -> list:
+    """Return the geometries of a scene moved to their places; the vertices are float64 there."""
+    if not isinstance(loaded, trimesh.Scene):
+        return [loaded]
+    parts = []
+    for node in loaded.graph.nodes_geometry:
+        matrix, name = loaded.graph[node]
+        part = loaded.geometry[name]
+        normals = _given_normals(part)
+        if not np.array_equal(matrix, np.eye(4)):
+            part = part.copy()
+            part.apply_transform(matrix)
+            if normals is not None:
+                normals = normals @ np.linalg.inv(matrix[:3, :3])
+        part.metadata["clsurf_normals"] = normals
+        parts.append(part)
+    return parts
+
+
+def _given_normals(part) -> NDArray | None:
+    """Return the normals that the file has; the property would compute them otherwise."""
+    cache = getattr(part, "_cache", None)
+    normals = None if cache is None else cache.cache.get("vertex_normals")
+    return None if normals is None or np.shape(normals) != np.shape(part.vertices) else np.asarray(normals)
 
 
 def _mesh_of(part: trimesh.Trimesh, path: Path) -> Mesh:
@@ -69,10 +95,8 @@ def _mesh_of(part: trimesh.Trimesh, path: Path) -> Mesh:
     faces = np.asarray(part.faces)
     if faces.min() < 0 or faces.max() >= count:
         raise FileFormatError(f"{path}: face index outside the {count:,} vertices: damaged file")
-    normals = None
-    if "vertex_normals" in part._cache.cache:  # given in the file; the property would compute them
-        normals = np.asarray(part._cache.cache["vertex_normals"], np.float32)
-        normals = normals if normals.shape == (count, 3) else None
+    normals = part.metadata.get("clsurf_normals", _given_normals(part))
+    normals = None if normals is None or len(normals) != count else np.asarray(normals, np.float32)
     colors = uv = texture = None
     visual = part.visual
     if visual.kind == "vertex":
@@ -147,8 +171,8 @@ def _quiet():
 
 
 def write_mesh(scan: Mesh | PointCloud, path: Path) -> None:
-    """Write .obj, .stl, .off or .glb at `path`, a temporary name that ends up as the stem of the real one."""
-    {".obj": _write_obj, ".stl": _write_stl, ".off": _write_off, ".glb": _write_glb}[path.suffix.lower()](scan, path)
+    """Write .obj, .stl or .glb at `path`, the temporary name that `replacing` gave."""
+    {".obj": _write_obj, ".stl": _write_stl, ".glb": _write_glb}[path.suffix.lower()](scan, path)
 
 
 def _faces(scan) -> NDArray:
@@ -167,14 +191,6 @@ def _write_stl(scan: Mesh, path: Path) -> None:
         rows.tofile(file)
 
 
-def _write_off(scan, path: Path) -> None:
-    faces, colors = _faces(scan), scan.colors
-    with open(path, "w", encoding="ascii", newline="\n") as file:
-        file.write(f"{'OFF' if colors is None else 'COFF'}\n{len(scan.points)} {len(faces)} 0\n")
-        _write_rows(file, [(_world(scan), _digits(scan))] + ([] if colors is None else [(colors, "%d")]))
-        _write_rows(file, [(faces, "%d")], "3 ")
-
-
 def _write_obj(scan, path: Path) -> None:
     """Write OBJ; colours follow the positions (a common extension), a texture goes to NAME.mtl and NAME.png."""
     faces, uv = _faces(scan), getattr(scan, "uv", None)
@@ -190,17 +206,17 @@ def _write_obj(scan, path: Path) -> None:
             beside.write_text(f"newmtl {stem}\nKa 1 1 1\nKd 1 1 1\nmap_Kd {stem}.png\n", encoding="utf-8")
             os.replace(beside, material)
         colors = [] if scan.colors is None else [(scan.colors[:, :3] / 255, "%.6f")]
-        _write_rows(file, [(_world(scan), _digits(scan)), *colors], "v ")
+        write_rows(file, [(world_of(scan), digits_of(scan)), *colors], "v ")
         if uv is not None:
-            _write_rows(file, [(uv, "%.9g")], "vt ")
+            write_rows(file, [(uv, "%.9g")], "vt ")
         if scan.normals is not None:
-            _write_rows(file, [(scan.normals, "%.9g")], "vn ")
+            write_rows(file, [(scan.normals, "%.9g")], "vn ")
         corner = {(False, False): "%d", (True, False): "%d/%d", (False, True): "%d//%d",
                   (True, True): "%d/%d/%d"}[uv is not None, scan.normals is not None]
         repeat = corner.count("%d")
         line = "f " + " ".join([corner] * 3) + "\n"
-        for at in range(0, len(faces), _BLOCK):
-            block = np.repeat(faces[at:at + _BLOCK] + 1, repeat, axis=1)
+        for at in range(0, len(faces), BLOCK):
+            block = np.repeat(faces[at:at + BLOCK] + 1, repeat, axis=1)
             file.write((line * len(block)) % tuple(block.ravel().tolist()))
 
 
@@ -230,19 +246,3 @@ def _write_glb(scan, path: Path) -> None:
 def _final_stem(path: Path) -> str:
     """Return the stem of the file that `replacing` made the temporary name `path` for: .STEM.RANDOM.ending."""
     return path.stem[1:].rsplit(".", 1)[0] if path.stem.startswith(".") else path.stem
-
-
-def _world(scan) -> NDArray:
-    return scan.points + scan.origin if scan.origin.any() else scan.points
-
-
-def _digits(scan) -> str:
-    return "%.15g" if scan.origin.any() else "%.9g"
-
-
-def _write_rows(file, parts, prefix: str = "") -> None:
-    """Write a line for each row of the arrays in `parts`, pairs of an (n, k) array and a number format."""
-    line = prefix + " ".join(" ".join([form] * array.shape[1]) for array, form in parts) + "\n"
-    for at in range(0, len(parts[0][0]), _BLOCK):
-        rows = np.concatenate([np.asarray(array[at:at + _BLOCK], np.float64) for array, _ in parts], axis=1)
-        file.write((line * len(rows)) % tuple(rows.ravel().tolist()))

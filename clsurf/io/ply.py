@@ -73,8 +73,8 @@ def _read_header(path: Path, data: bytes) -> tuple[str | None, list[_Element], i
     order, elements = "", []
     for line in data[:end].decode("latin-1").splitlines()[1:]:
         words = line.split()
-        if not words or words[0] in ("comment", "obj_info"):
-            continue
+        if not words or words[0] not in ("format", "element", "property"):
+            continue  # comments; the Happy Buddha's range images have stray words as well
         try:
             if words[0] == "format":
                 order = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
@@ -82,10 +82,8 @@ def _read_header(path: Path, data: bytes) -> tuple[str | None, list[_Element], i
                 elements.append(_Element(words[1], int(words[2]), []))
             elif words[0] == "property" and words[1] == "list":
                 elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
-            elif words[0] == "property":
-                elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
             else:
-                raise ValueError
+                elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
         except (KeyError, IndexError, ValueError):
             raise FileFormatError(f"{path}: damaged header line {line[:80]!r}") from None
     if order == "":

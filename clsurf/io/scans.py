@@ -1,5 +1,6 @@
 """Reading and writing scans: meshes and point clouds in every common format, chosen by the file's ending."""
 
+import importlib
 import logging
 import warnings
 from pathlib import Path
@@ -96,61 +97,13 @@ def _has(scan, name: str) -> bool:
     return value is not None and len(value) > 0
 
 
-def _read_ply(path):
-    from .ply import read_ply
-    return read_ply(path)
-
-
-def _read_text(path):
-    from .columns import read_text
-    return read_text(path)
-
-
-def _read_las(path):
-    from .las import read_las
-    return read_las(path)
-
-
-def _read_mesh(path):
-    from .meshes import read_mesh
-    return read_mesh(path)
-
-
-def _read_arrays(path):
-    from .numpy_files import read_numpy
-    return read_numpy(path)
-
-
-def _write_ply(scan, path):
-    from .ply import write_ply
-    write_ply(scan, path)
-
-
-def _write_text(scan, path):
-    from .columns import write_text
-    write_text(scan, path)
-
-
-def _write_las(scan, path):
-    from .las import write_las
-    write_las(scan, path)
-
-
-def _write_mesh(scan, path):
-    from .meshes import write_mesh
-    write_mesh(scan, path)
-
-
-def _write_arrays(scan, path):
-    from .numpy_files import write_numpy
-    write_numpy(scan, path)
-
-
-# The modules are imported by the format that needs them: laspy and trimesh take 0.3 s each.
-_MESH, _TEXT, _LAS = (_read_mesh, _write_mesh), (_read_text, _write_text), (_read_las, _write_las)
-_FORMATS = {".ply": (_read_ply, _write_ply), ".obj": _MESH, ".stl": _MESH, ".off": _MESH, ".glb": _MESH,
-            ".gltf": (_read_mesh, None), ".xyz": _TEXT, ".txt": _TEXT, ".asc": _TEXT, ".pts": _TEXT, ".csv": _TEXT,
-            ".npy": (_read_arrays, _write_arrays), ".npz": (_read_arrays, _write_arrays), ".las": _LAS, ".laz": _LAS}
+# Format: module, reader, writer. Modules are imported by the format that needs them: laspy and trimesh take 0.3 s each.
+_MESH, _LAS = ("meshes", "read_mesh", "write_mesh"), ("las", "read_las", "write_las")
+_TEXT, _NUMPY = ("columns", "read_text", "write_text"), ("numpy_files", "read_numpy", "write_numpy")
+_FORMATS = {".ply": ("ply", "read_ply", "write_ply"), ".obj": _MESH, ".stl": _MESH, ".glb": _MESH,
+            ".gltf": ("meshes", "read_mesh", None), ".off": ("off", "read_off", "write_off"), ".xyz": _TEXT,
+            ".txt": _TEXT, ".asc": _TEXT, ".pts": _TEXT, ".csv": _TEXT, ".npy": _NUMPY, ".npz": _NUMPY, ".las": _LAS,
+            ".laz": _LAS}
 _HOLDS = {".ply": "faces normals colors uv attributes", ".obj": "faces normals colors uv texture", ".stl": "faces",
           ".off": "faces colors", ".glb": "faces normals colors uv texture", ".xyz": "normals colors attributes",
           ".txt": "normals colors attributes", ".asc": "normals colors attributes", ".pts": "colors attributes",
@@ -159,7 +112,7 @@ _HOLDS = {".ply": "faces normals colors uv attributes", ".obj": "faces normals c
           ".laz": "normals colors attributes"}
 
 READS = tuple(_FORMATS)
-WRITES = tuple(ending for ending, (_, writer) in _FORMATS.items() if writer)
+WRITES = tuple(ending for ending, (*_, writer) in _FORMATS.items() if writer)
 
 
 def _format_of(path, purpose: str):
@@ -170,4 +123,5 @@ def _format_of(path, purpose: str):
     known = READS if purpose == "read" else WRITES
     if ending not in known:
         raise InputError(f"{path}: unknown scan format {ending or '(no ending)'}: expected one of {' '.join(known)}")
-    return _FORMATS[ending][purpose == "write"]
+    module, reader, writer = _FORMATS[ending]
+    return getattr(importlib.import_module(f"{__package__}.{module}"), reader if purpose == "read" else writer)
