@@ -11,7 +11,7 @@ from .camera import Camera
 from .frame import Frame
 from .scene import as_scene
 from .shade import CHANNELS, Shading, shade, shading_floats
-from .slim import draw_slim, surfel_colors, upload_slim
+from .slim import draw_slim, upload_slim
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
@@ -126,10 +126,7 @@ class Renderer:
         upload = self._uploads.get(surface)
         if upload is None:
             upload = self._uploads[surface] = upload_slim(self.device, surface)
-        colors = None
-        if grid.layout.color:
-            colors = surfel_colors(self.device, upload, shading)
-        draw_slim(self.device, self._scratch, grid, upload, matrix, camera, lod, number, colors)
+        draw_slim(self.device, self._scratch, grid, upload, matrix, camera, lod, shading, number)
 
     def _shade(self, grid, camera, origin, lights, shading, background, channels):
         offset = camera.eye - origin
@@ -176,7 +173,8 @@ def checked_channels(channels) -> tuple[str, ...]:
     channels = (channels,) if isinstance(channels, str) else tuple(dict.fromkeys(channels))
     unknown = [name for name in channels if name not in CHANNELS]
     if unknown or not channels:
-        raise InputError(f"channels: expected some of {', '.join(CHANNELS)}, got {', '.join(map(str, channels)) or 'none'}")
+        got = ", ".join(map(str, channels)) or "none"
+        raise InputError(f"channels: expected some of {', '.join(CHANNELS)}, got {got}")
     return channels
 
 
@@ -187,9 +185,9 @@ def checked_lod(lod) -> float:
     return float(lod)
 
 
-def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768), channels=("color", "depth", "normal"),
-           shading: Shading | None = None, lod: float = 4.0, background=(1.0, 1.0, 1.0, 1.0), device=None,
-           tile: int | None = None) -> Frame:
+def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
+           channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
+           background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.

@@ -49,6 +49,9 @@ class Shading:
     look : str
         "phong"; "flat": colours without light; "ball_size", "ball_level": the surfels' balls coloured by size or by
         level (paper, figures 1 and 7).
+    level : int, optional
+        With "ball_level": draw the surface as it is built up to this level, the leaves up to there pink and the
+        level's internal surfels blue (figure 7); None draws the chosen surfels, coloured by level.
     color : (3,) float
         sRGB colour, 0 to 1, of surfaces that have none.
     ambient, diffuse, specular : float
@@ -59,6 +62,7 @@ class Shading:
     """
 
     look: str = "phong"
+    level: int | None = None
     color: tuple[float, float, float] = (0.80, 0.78, 0.74)
     ambient: float = 0.12
     diffuse: float = 0.85

@@ -19,6 +19,8 @@ RECORD_FLOATS = 32  # kernels/common/slim.clh
 PLANES = 21  # kernels/common/select_slim.clh: 11 + up to 10 coefficients
 COEFFICIENT_PLANE = 11
 IS_LEAF, IS_ROOT = 1, 2
+SIZE_PLANE = 4
+PINK, BLUE = (0.95, 0.55, 0.65), (0.35, 0.50, 0.90)  # leaves and internal surfels, as in the paper's figure 7
 INTERNAL_SCALE = 1.5  # internal surfels are not alpha-covered: drawn at their own radius they leave holes
 LARGEST_COUNT = 1 << 30  # an index leaves two bits of a pair
 
@@ -159,11 +161,36 @@ def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
 
 def surfel_colors(device: Device, upload: SlimUpload, shading: Shading) -> DeviceArray:
     """Return the linear colours (count, 4) float32 that a surface is drawn with."""
-    if shading.model_colors and upload.colors is not None:
-        return upload.colors
-    plain = np.ones((max(upload.count, 1), 4), np.float32)
-    plain[:, :3] = to_linear(shading.color)
-    return device.upload(plain)
+    if shading.look == "phong" or shading.look == "flat":
+        if shading.model_colors and upload.colors is not None:
+            return upload.colors
+        srgb = np.broadcast_to(np.asarray(shading.color, np.float64), (upload.count, 3))
+    elif shading.look == "ball_size":
+        small, large = np.log(upload.radius_range)
+        radius = np.log(np.maximum(device.download(upload.planes)[SIZE_PLANE, :upload.count], 1e-30))
+        srgb = rainbow((large - radius) / max(large - small, 1e-9))
+    elif shading.level is not None:
+        leaf = device.download(upload.flags) & IS_LEAF
+        srgb = np.where(leaf[:, None], PINK, BLUE)
+    else:
+        level = device.download(upload.levels)
+        srgb = rainbow((level - level.min()) / max(np.ptp(level), 1))
+    out = np.ones((upload.count, 4), np.float32)
+    out[:, :3] = to_linear(srgb)
+    return device.upload(out)
+
+
+def rainbow(t: NDArray) -> NDArray:
+    """Return sRGB colours (n, 3) from blue at 0 over green to red at 1."""
+    t = np.clip(np.asarray(t, np.float64), 0, 1)[:, None]
+    return np.clip(1.5 - np.abs(4 * t - np.array([3.0, 2.0, 1.0])), 0.1, 1)
+
+
+def level_flags(device: Device, upload: SlimUpload, level: int) -> DeviceArray:
+    """Return flags (count,) uint8 that draw the leaves up to `level` and its internal surfels, and nothing else."""
+    levels, leaf = device.download(upload.levels), device.download(upload.flags) & IS_LEAF > 0
+    shown = np.where(leaf, levels <= level, levels == level)
+    return device.upload(((IS_LEAF | IS_ROOT) * shown).astype(np.uint8))
 
 
 def place_slim(upload: SlimUpload, matrix: NDArray | None, camera, size, lod: float) -> tuple[NDArray, int]:
@@ -190,10 +217,10 @@ def place_slim(upload: SlimUpload, matrix: NDArray | None, camera, size, lod: fl
 def select_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: DeviceArray,
                 visited_end: int) -> DeviceArray:
     """Walk the hierarchy level by level; return which surfels the walk reaches, (count,) uint8."""
-    visited = scratch.array("visited", (max(upload.count, 1),), np.uint8)
-    if visited_end >= upload.count:
-        return visited  # not read: every surfel comes before visited_end
+    visited = scratch.array("visited", (upload.count,), np.uint8)
     device.fill(visited, 0)
+    if visited_end >= upload.count:
+        return visited
     kernel = device.kernel("render/select_slim.cl", constants={"VW": scratch.lanes})
     # Levels before the one that ends at visited_end need no search: their children are visited anyway.
     start = int(np.searchsorted(upload.level_end, visited_end)) - 1
@@ -204,43 +231,50 @@ def select_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: Devi
     return visited
 
 
-def project_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: DeviceArray, visited: DeviceArray,
-                 visited_end: int) -> tuple[DeviceArray, Footprints]:
+def project_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: DeviceArray, flags: DeviceArray,
+                 visited: DeviceArray, visited_end: int, balls: bool) -> tuple[DeviceArray, Footprints]:
     """Cut, cull and project all surfels; return their records (count, 32) float32 and where they touch the picture."""
     n = upload.count
     device.check_memory(records=4 * RECORD_FLOATS * n)
     records, touch = scratch.array("records", (n, RECORD_FLOATS), np.float32), new_footprints(device, scratch, n)
     items = -(-n // scratch.lanes)
-    device.kernel("render/project_slim.cl", constants={"VW": scratch.lanes, "DEGREE": upload.degree})(
-        (items,), (min(16, items),), view, upload.planes, upload.stride, n, upload.flags, upload.footprint, visited,
+    device.kernel("render/project_slim.cl", constants={"VW": scratch.lanes, "DEGREE": upload.degree,
+                                                            "BALLS": balls})(
+        (items,), (min(16, items),), view, upload.planes, upload.stride, n, flags, upload.footprint, visited,
         visited_end, records, touch.full, touch.core, touch.keys, touch.buckets)
     return records, touch
 
 
 def tile_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, view: DeviceArray,
-              records: DeviceArray, pairs: PairLists, colors: DeviceArray | None, number: int) -> None:
-    """Draw the surfels of every bin into its planes, the paper's two passes.
+              records: DeviceArray, pairs: PairLists, colors: DeviceArray | None, number: int,
+              balls: bool) -> None:
+    """Draw the surfels of every bin into its planes, the paper's two passes, or their balls.
 
     `number` is the surface's place in the scene, for the channel "id".
     """
-    constants = grid.layout.constants | {"VW": scratch.lanes, "DEGREE": upload.degree, "ORIENTED": upload.oriented,
-                                         "HAS_COLOR": colors is not None, "TILE_BINS": grid.tile_bins}
+    constants = grid.layout.constants | {"VW": scratch.lanes, "DEGREE": upload.degree, "TILE_BINS": grid.tile_bins}
+    if not balls:
+        constants |= {"ORIENTED": upload.oriented, "HAS_COLOR": colors is not None}
     group = 64 if scratch.lanes == 1 else 1
-    device.kernel("render/tile_slim.cl", constants=constants)(
+    device.kernel("render/tile_balls.cl" if balls else "render/tile_slim.cl", constants=constants)(
         (grid.tile_count * group,), (group,), view, pairs.pairs, pairs.offsets, records,
         view if colors is None else colors, upload.levels, number, grid.tiles_x, grid.tile_count, grid.bins_x,
         grid.bins_y, grid.touched, grid.planes)
 
 
-def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, matrix, camera, lod: float, number: int,
-              colors: DeviceArray | None) -> None:
+def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, matrix, camera, lod: float,
+              shading: Shading, number: int) -> None:
     """Run all stages of one placed surface: select, project, bin, tile."""
     if upload.count == 0:
         return
-    floats, visited_end = place_slim(upload, matrix, camera, grid.size, lod)
+    balls = shading.look.startswith("ball")
+    one_level = balls and shading.level is not None
+    floats, visited_end = place_slim(upload, matrix, camera, grid.size, 0.0 if one_level else lod)
     view = device.upload(floats)
     visited = select_slim(device, scratch, upload, view, visited_end)
-    records, footprints = project_slim(device, scratch, upload, view, visited, visited_end)
+    flags, visited_end = (level_flags(device, upload, shading.level), 0) if one_level else (upload.flags, visited_end)
+    records, footprints = project_slim(device, scratch, upload, view, flags, visited, visited_end, balls)
     pairs = bin_pairs(device, scratch, grid, footprints, upload.count)
     if pairs is not None:
-        tile_slim(device, scratch, grid, upload, view, records, pairs, colors, number)
+        colors = surfel_colors(device, upload, shading) if balls or grid.layout.color else None
+        tile_slim(device, scratch, grid, upload, view, records, pairs, colors, number, balls)

@@ -109,11 +109,14 @@ def view_floats(camera, size, rotation=None, offset=None, scale=1.0, lod=0.0, de
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Where the primitives of one surface may touch the picture, for `bin_pairs`; (count, ...) each."""
+    """Where the primitives of one surface may touch the picture, for `bin_pairs`.
 
-    full: DeviceArray  # (count, 4) int16: first and last block of 4x4 pixels, x and y, of pass 2; first x > last x: none
-    core: DeviceArray  # (count, 4) int16: the same of pass 1
-    keys: DeviceArray  # (count,) uint32: least depth in the high 24 bits; bit 0: seen from the front, bit 1: from behind
+    Ranges are the first and last block of 4x4 pixels in x and y; first x > last x: nowhere.
+    """
+
+    full: DeviceArray  # (count, 4) int16: range of pass 2
+    core: DeviceArray  # (count, 4) int16: range of pass 1
+    keys: DeviceArray  # (count,) uint32: least depth in the high 24 bits; bit 0: may be seen from the front, 1: behind
     buckets: DeviceArray  # (count,) uint16: depth bucket
 
 
@@ -159,8 +162,8 @@ def bin_pairs(device: Device, scratch: "Scratch", grid: Grid, footprints: Footpr
     device.check_memory(bin_counts=4 * bins * parts, bin_offsets=8 * (bins + 1))
     counts = scratch.array("bin_counts", (parts, bins), np.uint32)
     offsets = scratch.array("bin_offsets", (bins + 1,), np.uint32)
-    device.kernel("render/count_bins.cl")((parts,), None, order, depth_offsets, footprints.full, parts, grid.bins_x, bins,
-                                          counts)
+    device.kernel("render/count_bins.cl")((parts,), None, order, depth_offsets, footprints.full, parts, grid.bins_x,
+                                          bins, counts)
     scan(device, counts, parts, bins, scratch.array("bin_totals", (bins,), np.uint32), offsets)
     total = int(device.download(offsets, copy=False)[-1])
     if total == 0:

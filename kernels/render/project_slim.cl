@@ -10,6 +10,9 @@
 #ifndef ALPHA
 #define ALPHA 0.8f  // pass 1 draws balls shrunk by this
 #endif
+#ifndef BALLS
+#define BALLS 0  // 1: bound the balls themselves, at their own size, for tile_balls
+#endif
 #ifndef BACK_BIAS
 #define BACK_BIAS 0.25f  // radii that a hit from behind is set back by
 #endif
@@ -70,7 +73,7 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   float scale = view[SCALE];
   VF X = scale * (view[0] * x + view[1] * y + view[2] * z) + view[OFFSET];
   VF Y = scale * (view[3] * x + view[4] * y + view[5] * z) + view[OFFSET + 1];
-  VF r = scale * plane[BALL_RADIUS * step], inv_r = 1.0f / r;
+  VF r = scale * plane[(BALLS ? SIZE_RADIUS : BALL_RADIUS) * step], inv_r = 1.0f / r;
   // The frame of the stored normal (common/frame.clh in lanes), turned into view space.
   VF nx = plane[NORMAL * step], ny = plane[(NORMAL + 1) * step], nz = plane[(NORMAL + 2) * step];
   VF sign = SEL((VF)(1.0f), (VF)(-1.0f), AS_VI(nz) < 0);
@@ -98,6 +101,7 @@ __kernel void project_slim(__global const float *view, __global const float *sur
 
   // Depth and screen bounds of the piece of surface.
   VF low = plane[LOW * step], high = plane[HIGH * step], slope = plane[SLOPE * step];
+  if (BALLS) { low = SEL((VF)(-1.0f), low, low > high); high = SEL((VF)(1.0f), high, low > high); }
   VF front, back, one = 1.0f;
   extent(one, -nZ, 1.0f, low, high, &front, &back);
   VF near = depth + r * front, far = depth + r * back;
