@@ -113,3 +113,13 @@ def test_quick_jobs_check_and_measure(job, device, tmp_path, monkeypatch, capsys
         generated = found["figures"]["generated"]
         assert generated["rms_percent"] < 0.1 and generated["build"]["median_s"] > 0
     assert "kernel or stage" in capsys.readouterr().out
+
+
+def test_report_shows_what_was_measured_and_dashes_elsewhere():
+    from bench import report
+    made = {"device": "D", "platform": "P", "driver": "1", "cpu": "C", "commit": "abc", "date": "today"}
+    figures = {"build": {"bunny": {"build": {"median_s": 0.1234}}}}
+    text = report.markdown({"pocl": figures, "intel": {}}, {"pocl": made})
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(lines) == 2 + len(report.ROWS) and all(line.count("|") == 6 for line in lines)
+    assert "| bunny build, T 0.01 | 0.15 s | 0.06 s | 0.123 s | - |" in lines and "commit abc" in text
