@@ -1,1 +1,29 @@
-"""clsurf: compact surface models from scans, drawn, traced, measured and cleaned on any OpenCL device."""
+"""clsurf: compact surface models from scans, drawn, traced, measured and cleaned on any OpenCL device.
+
+The public names on one screen; every other name is private to the package.
+"""
+
+from . import errors, models
+from .build.normals import estimate_normals
+from .build.project import Projection, project
+from .build.slim import build_slim
+from .device import Device, Profile, open_device
+from .errors import Error
+from .io import load, save
+from .render.camera import Camera
+from .render.frame import Frame
+from .render.renderer import Renderer, render
+from .render.scene import Scene
+from .render.shade import Shading
+from .surface.cloud import PointCloud
+from .surface.mesh import Mesh
+from .surface.placed import Placed
+from .surface.slim import SlimSurface
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Camera", "Device", "Error", "Frame", "Mesh", "Placed", "PointCloud", "Profile", "Projection", "Renderer", "Scene",
+    "Shading", "SlimSurface", "build_slim", "errors", "estimate_normals", "load", "models", "open_device", "project",
+    "render", "save",
+]

@@ -20,7 +20,8 @@ app = typer.Typer(name="clsurf", no_args_is_help=True, add_completion=False, pre
                   context_settings={"help_option_names": ["-h", "--help"]})
 
 DeviceOption = Annotated[str, typer.Option("--device", "-d", help="gpu, cpu, pocl, intel, nvidia, amd, gpu:1 or part "
-                                           "of a name; default: CLSURF_DEVICE, else a GPU, else the fastest CPU runtime.")]
+                                           "of a name; default: CLSURF_DEVICE, else a GPU, else the fastest CPU "
+                                           "runtime.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 ErrorOption = Annotated[str, typer.Option(help="T_MDL relative to the bounding box's diagonal, or 'auto': from the "
                                           "scan's noise.")]
@@ -221,9 +222,8 @@ def render(source: Annotated[Path, typer.Argument(help="A surface, or a scan (it
            direction: Annotated[str, typer.Option(help="From the target to the eye: x,y,z.")] = "1,0.5,2",
            up: Annotated[str, typer.Option(help="Upward: x,y,z.")] = "0,1,0",
            fov: Annotated[float, typer.Option(help="Vertical field of view, degrees.")] = 40.0,
-           channels: Annotated[str, typer.Option(help="Comma-separated: color,depth,normal,position,level,count,cost,id")
-                               ] = "color,depth,normal",
-           shading: Annotated[str, typer.Option(help="phong, normals, ball_size or ball_level")] = "phong",
+           channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id.")] = "color,depth,normal",
+           shading: Annotated[str, typer.Option(help="phong, flat, ball_size or ball_level.")] = "phong",
            lod: Annotated[float, typer.Option(help="Projected diameter in pixels below which coarser surfels serve; 8 "
                                               "is the fast mode, 0 draws leaves only.")] = 4.0,
            degree: DegreeOption = 2, error: ErrorOption = "0.01",
