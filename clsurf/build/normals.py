@@ -131,7 +131,8 @@ def _suitable_k(tree) -> int:
     signs.
     """
     spread = sampled_covariance(tree, 16, 5000).eigenvalues
-    ratio = np.sqrt(np.median(spread[:, 0] / np.maximum(spread[:, 1], np.finfo(np.float32).tiny)))
+    with np.errstate(invalid="ignore"):  # squares of huge coordinates are infinite
+        ratio = np.sqrt(np.median(spread[:, 0] / np.maximum(spread[:, 1], np.finfo(np.float32).tiny)))
     return 48 if ratio > NOISY else 16
 
 

@@ -138,10 +138,12 @@ __kernel void knn_covariance(__global const VF *nodes, __global const float *lea
   VI flip = (u[2] < 0.0f) | ((u[2] == 0.0f) & ((u[1] < 0.0f) | ((u[1] == 0.0f) & (u[0] < 0.0f))));
   inverse = SEL(inverse, -inverse, flip);
 
+  // Rounding may leave eigenvalues of nothing below 0.
+  least = SEL(least, (VF)(0.0f), least < 0.0f), middle = SEL(middle, (VF)(0.0f), middle < 0.0f);
   trace *= unit * unit;
   union { VF v; float s[VW]; } out[7];
   for (int a = 0; a < 3; a++) out[a].v = u[a] * inverse;
-  out[3].v = SEL(least, (VF)(0.0f), least < 0.0f) * trace, out[4].v = middle * trace, out[5].v = largest * trace;
+  out[3].v = least * trace, out[4].v = middle * trace, out[5].v = largest * trace;
   out[6].v = VSQRT(best[K - 1]) * unit;
   for (uint j = 0; j < VW && first + j < query_count; j++) {
     uint i = query_order[first + j];
