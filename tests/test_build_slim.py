@@ -56,7 +56,7 @@ def fixed_radius_surface(points, normals, degree, spacings, device):
     tree = build_point_tree(points, normals, np.zeros(3, np.float32), 1 / diagonal, device)
     near = cKDTree(points).query(points[::97], 13)[0][:, 12]
     radius = spacings * float(np.median(near)) / np.sqrt(12.5 / np.pi)
-    levels = build_levels(tree, degree, 1e-9, silent, fixed_radius=radius / diagonal)
+    levels = build_levels(tree, degree, 1e-9, 0.01, silent, fixed_radius=radius / diagonal)
     return assemble(levels, Points(points, normals, None, None), tree, degree, 0.01, diagonal, np.zeros(3))
 
 

@@ -111,7 +111,7 @@ def fitted(tree, degree, centers, r_r, penalty=1e-9, mode=slim.SEGMENT):
     need = 2 * twin.terms(degree) + 2
     out = device.empty((len(centers), slim.RECORD), np.float32)
     kernel = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree})
-    kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, penalty, need, mode,
+    kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, penalty, 0.02, need, mode,
            *tree.arguments, out)
     return device.download(out), need
 

@@ -88,7 +88,7 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
     noise = measure_noise(tree)
     error = automatic_error(noise) if error == "auto" else float(error)
     report("points", 1.0)
-    levels = build_levels(tree, degree, max(noise.variance * error**2, LEAST_PENALTY), report)
+    levels = build_levels(tree, degree, max(noise.variance * error**2, LEAST_PENALTY), noise.spacing, report)
     surface = assemble(levels, points, tree, degree, error, diagonal, scan.origin)
     report("bound", 0.0)
     surface = with_bound(surface, tree, middle)
@@ -218,14 +218,16 @@ class Level:
     record: NDArray  # (m, RECORD) float32: radius, normal, e, leaf, coefficients
 
 
-def build_levels(tree: PointTree, degree: int, penalty: float, report, fixed_radius: float | None = None
-                 ) -> list[Level]:
+def build_levels(tree: PointTree, degree: int, penalty: float, point_spacing: float, report,
+                 fixed_radius: float | None = None) -> list[Level]:
     """Cover the points level by level until every point is covered by leaves.
 
     Parameters
     ----------
     penalty : float
         lambda T^2, over diagonal^4.
+    point_spacing : float
+        Over the diagonal.
     report : callable
         report(stage, done).
     fixed_radius : float, optional
@@ -259,7 +261,8 @@ def build_levels(tree: PointTree, degree: int, penalty: float, report, fixed_rad
                 break
             center = device.upload(chosen)
             record = device.empty((len(chosen), RECORD), np.float32)
-            fit((len(chosen),), (1,), len(chosen), center, r_r, penalty, need, mode, *tree.arguments, record)
+            fit((len(chosen),), (1,), len(chosen), center, r_r, penalty, point_spacing, need, mode, *tree.arguments,
+                record)
             cover((len(chosen),), (1,), len(chosen), center, record, *tree.arguments, overlap, held)
             centers.append(chosen)
             records.append(record)

@@ -14,6 +14,9 @@
 #define FIXED 2   // always a leaf, with radius r_r
 #define CUBIC_LIMIT 1.0f // |c r^2| of a cubic term; beyond it the cubic terms of a lane are dropped
 #define NORMAL_SHARE 0.618034f // of r_r: the ball whose mean normal sets the frame
+#define COMPANY 5  // points of a ball; fewer is alone
+#define SPARSE 6.0f    // point spacings: a quarter of a disc of that radius has more points than a quadratic needs
+#define LONE_DISC 3.0f // point spacings
 #define RECORD 16 // floats out: radius, normal, e, leaf, coefficients from 6
 
 #ifdef WEIGHTED
@@ -193,7 +196,19 @@ inline int choose_lane(const float *energy, const float *e2, const int *count, i
   return *leaf ? best : 14;
 }
 
-__kernel void fit_surfels(int surfels, __global const int *center, float r_r, float lambda_t2, int need, int mode,
+// A small disc with the point's own normal.
+inline void write_disc(__global float *o, float radius, float x, float y, float z) {
+  for (int i = 0; i < RECORD; ++i) o[i] = 0.0f;
+  o[0] = radius;
+  o[1] = x;
+  o[2] = y;
+  o[3] = z < 1e-5f && z > -1e-5f ? (z < 0.0f ? -1e-5f : 1e-5f) : z;
+  o[5] = 1.0f;
+}
+
+// A ball with too few points grows to twice its size or to SPARSE point spacings, and makes do with what it then has;
+// a point that is nearly alone gets a disc: a grown ball would bridge to the next surface.
+__kernel void fit_surfels(int surfels, __global const int *center, float r_r, float lambda_t2, float spacing, int need, int mode,
                           int padded, __global const float *sorted, __global const float *boxes,
                           __global const int *node_offset, int top_level, __global float *out) {
   int s = get_global_id(0);
@@ -203,10 +218,19 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
   Ball ball;
   float radius = r_r;
   gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius);
-  while (ball.count < need && radius < 8.0f) { // too sparse here: the ball grows until it has enough
-    radius *= 1.25f;
+  if (ball.count < need) {
+    if (ball.count < COMPANY && r_r > SPARSE * spacing) {
+      write_disc(out + RECORD * (size_t)s, r_r < LONE_DISC * spacing ? r_r : LONE_DISC * spacing,
+                 sorted[3 * (size_t)padded + own], sorted[4 * (size_t)padded + own], sorted[5 * (size_t)padded + own]);
+      return;
+    }
+    float limit = 2.0f * r_r > SPARSE * spacing ? 2.0f * r_r : SPARSE * spacing;
     mode = mode == SEGMENT ? FORCED : mode;
-    gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius);
+    while (ball.count < need && radius < limit) {
+      radius *= 1.25f;
+      gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius);
+    }
+    need = need < ball.count ? need : ball.count;
   }
   // Lanes' radii over the ball's: g^(2 (14 - i) / 14).
   VF r = (VF)(0.381966011f, 0.409151886f, 0.438272665f, 0.469466063f, 0.502879599f, 0.538671289f, 0.577010394f,
