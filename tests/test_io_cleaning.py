@@ -114,3 +114,12 @@ def test_order_is_kept(count):
     points = np.random.default_rng(1).random((count, 3)).astype(np.float32)
     twice = np.concatenate([points, points[::-1]])
     assert (clean_scan(PointCloud(twice)).points == points).all()
+
+
+def test_few_duplicates_among_many():
+    points = np.random.default_rng(2).random((20_000, 3)).astype(np.float32)
+    points[[7000, 19_000]] = points[11]
+    points[15_000] = points[4]
+    first, target = first_of_duplicates(points)
+    assert np.array_equal(first, np.delete(np.arange(20_000), [7000, 15_000, 19_000]))
+    assert target[[7000, 15_000, 19_000]].tolist() == [11, 4, 11] and (points[first][target] == points).all()

@@ -108,13 +108,14 @@ def _clean_mesh(scan: Mesh, dropped: dict[str, int]) -> Mesh:
 
 def _unit_normals(normals: NDArray) -> tuple[NDArray, NDArray, bool]:
     """Return unit normals (n, 3) float32, which are usable (n,) bool, and whether any had to be scaled."""
-    with np.errstate(over="ignore", invalid="ignore"):
+    normals = np.nan_to_num(normals, nan=0, posinf=0, neginf=0)
+    with np.errstate(over="ignore"):
         length2 = np.einsum("ij,ij->i", normals, normals, dtype=np.float64)
     usable = np.isfinite(length2) & (length2 > 0)
     if (np.abs(length2[usable] - 1) <= 2 * _UNIT).all():
         return normals, usable, False
-    scale = np.where(usable, 1 / np.sqrt(np.where(usable, length2, 1)), 0)
-    return (normals * scale[:, None]).astype(np.float32), usable, True
+    scale = 1 / np.sqrt(np.where(usable, length2, 1))
+    return np.where(usable[:, None], normals * scale[:, None], 0).astype(np.float32), usable, True
 
 
 def _merged_normals(normals: NDArray, first: NDArray, target: NDArray) -> NDArray:
@@ -148,15 +149,23 @@ def first_of_duplicates(keys: NDArray) -> tuple[NDArray, NDArray]:
         hashes *= MIX
         hashes ^= hashes >> np.uint64(29)
     ordered = np.sort(hashes)
-    if not (ordered[1:] == ordered[:-1]).any():
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if not len(repeated):
         return np.arange(count), np.arange(count)
+    rows = np.arange(count)
+    if len(repeated) < count // 64:  # few: look only at rows whose hash occurs twice
+        repeated = repeated[np.append(True, repeated[1:] != repeated[:-1])]
+        place = np.minimum(np.searchsorted(repeated, hashes), len(repeated) - 1)
+        rows = np.flatnonzero(repeated[place] == hashes)
+        bits, hashes = bits[rows], hashes[rows]
     order = np.argsort(hashes)
     starts = np.append(True, hashes[order[1:]] != hashes[order[:-1]])
     if (bits[order[1:]][~starts[1:]] != bits[order[:-1]][~starts[1:]]).any():  # different rows of one hash
         order = np.lexsort(bits.T)
         starts = np.append(True, (bits[order[1:]] != bits[order[:-1]]).any(axis=1))
     begins = np.flatnonzero(starts)
-    owner = np.empty(count, np.int64)
-    owner[order] = np.repeat(np.minimum.reduceat(order, begins), np.diff(begins, append=count))
+    earliest = rows[np.minimum.reduceat(order, begins)]
+    owner = np.arange(count)
+    owner[rows[order]] = np.repeat(earliest, np.diff(begins, append=len(order)))
     kept = owner == np.arange(count)
     return np.flatnonzero(kept), (np.cumsum(kept) - 1)[owner]

@@ -112,8 +112,8 @@ def save_slim2t(surface: SlimSurface, path) -> None:
 
 
 def _parents(path, column: NDArray) -> NDArray:
-    parent = np.rint(column).astype(np.int64)
-    count = len(parent)
+    count = len(column)
+    parent = np.rint(np.clip(column, -2, count + 1)).astype(np.int64)
     bad = (parent != column) | (parent > count) | ((parent < 1) & (parent != -1)) | (parent == np.arange(1, count + 1))
     if bad.any():
         raise FileFormatError(f"{path}: damaged: ball {int(np.flatnonzero(bad)[0]) + 1:,} has the parent "

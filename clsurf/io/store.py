@@ -105,7 +105,9 @@ def _read_group(path: Path, group: zarr.Group, members: "_Members"):
                               f"version {VERSION}: install a newer clsurf")
     if kind not in KINDS:
         raise FileFormatError(f"{path}: holds the unknown kind {kind!r}: expected {', '.join(KINDS)}")
-    found = {name: item for name, item in group.members(max_depth=2) if isinstance(item, zarr.Array)}
+    # One by one: zarr's concurrent listing of members writes the traceback of a damaged one to the terminal.
+    names = [key.removesuffix("/zarr.json") for key in sorted(members.sizes) if key.endswith("/zarr.json")]
+    found = {name: item for name, item in ((name, group[name]) for name in names) if isinstance(item, zarr.Array)}
     for name, array in found.items():
         _check_array(path, name, array, members)
     return from_arrays(kind, {name: np.asarray(array[...]) for name, array in found.items()}, dict(about["values"]))
