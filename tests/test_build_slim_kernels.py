@@ -1,5 +1,7 @@
 """Every kernel of the SLIM build against its float64 twin."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -82,12 +84,27 @@ def test_node_boxes(device):
 def test_open_points(device):
     rng = np.random.default_rng(0)
     overlap, held = rng.integers(0, 20, 160, dtype=np.uint32), (rng.uniform(size=160) < 0.2).astype(np.uint8)
-    state, any_open = device.empty(160, np.uint8), device.empty(10, np.uint8)
-    device.kernel("build/open_points.cl")((10,), (1,), 150, 10, 10, device.upload(overlap), device.upload(held), state,
-                                          any_open)
+    state = device.empty(160, np.uint8)
+    device.kernel("build/open_points.cl")((10,), (1,), 150, 10, 10, device.upload(overlap), device.upload(held), state)
     expected = twin.open_points(overlap, held, 10) & (np.arange(160) < 150)
     assert ((device.download(state) == 0) == expected).all()
-    assert (device.download(any_open) == expected.reshape(10, 16).any(axis=1)).all()
+
+
+def test_cells(tree, sorted_points):
+    points, _ = sorted_points
+    for some in (None, np.flatnonzero(np.random.default_rng(0).uniform(size=tree.count) < 0.1)):
+        first, end, colors = tree.cells(0.1, some)
+        seen = np.zeros(tree.count, int)
+        for a, b in zip(first, end, strict=True):
+            seen[a:b] += 1
+            assert np.ptp(points[a:b], axis=0).max() < 0.21
+        assert seen.max() == 1 and (seen[some if some is not None else slice(None)] == 1).all()
+        for start, stop in itertools.pairwise(colors):
+            ranges = zip(first[start:stop], end[start:stop], strict=True)
+            middles = np.array([points[a:b].mean(axis=0) for a, b in ranges])
+            for m in middles:  # cells of one colour are a whole cell apart
+                other = np.abs(middles - m).max(axis=1)
+                assert ((other == 0) | (other > 0.1)).all()
 
 
 @pytest.mark.parametrize("spacing", (0.02, 0.1, 2.0))
@@ -95,14 +112,14 @@ def test_choose_centers(tree, sorted_points, spacing):
     device, points = tree.device, sorted_points[0]
     closed = np.ones(tree.padded, np.uint8)
     closed[:tree.count] = np.random.default_rng(0).uniform(size=tree.count) < 0.3
-    state, cells = device.empty(tree.padded, np.uint8), tree.cells(spacing * 1.001)
+    state = device.empty(tree.padded, np.uint8)
     device.write(state, closed)
-    blocks_open = device.upload((closed.reshape(-1, 16) == 0).any(axis=1).astype(np.uint8))
-    kernel = device.kernel("build/choose_centers.cl")
-    for first, last in cells:
-        kernel((len(first),), (1,), len(first), first, last, spacing, *tree.arguments, blocks_open, state)
+    first, end, colors = tree.cells(spacing * 1.001, np.flatnonzero(closed == 0))
+    kernel, on_device = device.kernel("build/choose_centers.cl"), (device.upload(first), device.upload(end))
+    for start, stop in itertools.pairwise(colors):
+        kernel((stop - start,), (1,), stop - start, start, *on_device, spacing, *tree.arguments, state)
     chosen = np.flatnonzero(device.download(state) == slim.CENTER)
-    ranges = [(device.download(a), device.download(b)) for a, b in cells]
+    ranges = [(first, end)]  # sorted by colour
     assert (chosen == twin.choose_centers(points, closed[:tree.count] == 0, ranges, spacing)).all()
 
 

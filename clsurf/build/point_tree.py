@@ -1,7 +1,7 @@
 """Points sorted along the Morton curve, with a 16-wide tree of boxes for ball queries on the device."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,6 @@ class PointTree:
     node_offset: DeviceArray
     top_level: int
     scale: float
-    cells_of_step: dict = field(default_factory=dict)
 
     @property
     def arguments(self) -> tuple:
@@ -57,22 +56,31 @@ class PointTree:
         """Whether the points have weights."""
         return self.sorted.shape[0] == 7
 
-    def cells(self, width: float) -> list[tuple[DeviceArray, DeviceArray]]:
-        """Return first and last + 1 point of the occupied cells at least `width` wide, one pair of arrays per colour.
+    def cells(self, width: float, points: NDArray | None = None) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the cells at least `width` wide that hold points, sorted by colour.
 
-        The colour of a cell is the parity of its three integer coordinates: up to 8 colours.
+        Parameters
+        ----------
+        points : (m,) int, optional
+            Ascending indices of the sorted points that count; all by default.
+
+        Returns
+        -------
+        first, end : (c,) int32
+            First counting point of every cell, and the last one + 1.
+        colors : (9,) int
+            Cells of colour k are colors[k] to colors[k + 1]; the colour is the parity of a cell's three coordinates.
         """
-        step = max(0, math.ceil(math.log2(max(width * self.scale, 1.0))))
-        step = min(step, self.bits)
-        if step not in self.cells_of_step:
-            cell = self.codes >> np.uint64(3 * step)
-            start = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]])).astype(np.int32)
-            end = np.append(start[1:], np.int32(self.count)).astype(np.int32)
-            color = (cell[start] & np.uint64(7)).astype(np.uint8)
-            groups = [np.flatnonzero(color == c) for c in range(8)]
-            self.cells_of_step[step] = [(self.device.upload(start[g]), self.device.upload(end[g]))
-                                        for g in groups if len(g)]
-        return self.cells_of_step[step]
+        step = min(max(0, math.ceil(math.log2(max(width * self.scale, 1.0)))), self.bits)
+        cell = (self.codes if points is None else self.codes[points]) >> np.uint64(3 * step)
+        start = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]]))
+        last = np.append(start[1:], len(cell)) - 1
+        color = (cell[start] & np.uint64(7)).astype(np.uint8)
+        order = np.argsort(color, kind="stable")
+        start, last = start[order], last[order]
+        if points is not None:
+            start, last = points[start], points[last]
+        return start.astype(np.int32), (last + 1).astype(np.int32), np.searchsorted(color[order], np.arange(9))
 
 
 def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: float, device: Device,

@@ -2,7 +2,7 @@
 //
 // One work-item per cell, one launch per colour (parity of the cell's three coordinates). Cells are at least `spacing`
 // wide, so cells of one colour cannot see each other's centres: the launches together are a sequential greedy choice
-// whose order is colour, then point. `open` says which blocks of 16 points had an open point before the first launch.
+// whose order is colour, then point. A launch takes `cells` cells from number `first` on.
 #include "common/lanes.clh"
 #include "build/point_tree.clh"
 
@@ -10,21 +10,17 @@
 #define TAKEN 1
 #define CENTER 2
 
-__kernel void choose_centers(int cells, __global const int *cell_start, __global const int *cell_end, float spacing,
+__kernel void choose_centers(int cells, int first, __global const int *cell_start, __global const int *cell_end, float spacing,
                              int padded, __global const float *sorted, __global const float *boxes,
-                             __global const int *node_offset, int top_level, __global const uchar *open, __global uchar *state) {
+                             __global const int *node_offset, int top_level, __global uchar *state) {
   int cell = get_global_id(0);
   if (cell >= cells) return;
   __global const float *px = sorted, *py = sorted + padded, *pz = sorted + 2 * (size_t)padded;
-  int start = cell_start[cell], end = cell_end[cell];
+  int start = cell_start[first + cell], end = cell_end[first + cell];
   float spacing2 = spacing * spacing;
   uint list[BLOCK_LIST];
   Traversal t;
   for (int i = start; i < end; ++i) {
-    if (!open[i / 16]) {
-      i |= 15; // on to the next block
-      continue;
-    }
     if (state[i] != OPEN) continue;
     float x = px[i], y = py[i], z = pz[i];
     traversal_start(&t, top_level);
