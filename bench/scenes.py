@@ -2,7 +2,7 @@
 
 import functools
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +64,10 @@ def scene(name: str) -> Scene:
     if not path.exists():
         raise InputError(f"scene {name}: expected the scan {FILES[name]} in the folder that CLSURF_DATA names, found "
                          f"none: set CLSURF_DATA, or use --quick for a generated scan")
-    return Scene(name, load_scan(path))
+    scan = load_scan(path)
+    if scan.normals is None:  # builds are measured from points with normals
+        scan = replace(scan, normals=vertex_normals(scan.vertices, scan.faces))
+    return Scene(name, scan)
 
 
 def wavy_torus(around: int = 400, across: int = 150) -> Mesh:
