@@ -166,12 +166,8 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   field[BIAS] = BACK_BIAS * r; field[REACH] = r + off;
   field[FOOT_LO] = 0.0f; field[FOOT_HI] = 0.0f;
   field[K0] = k[0];
-#if DEGREE >= 2
-  for (int i = 1; i < 6; i++) field[K0 + i] = k[i * step];
-#endif
-#if DEGREE >= 3
-  for (int i = 6; i < 10; i++) field[K6 + i - 6] = k[i * step];
-#endif
+  for (int i = 1; i < 6; i++) field[K0 + i] = DEGREE >= 2 ? k[i * step] : (VF)(0.0f);
+  for (int i = 6; i < 10; i++) field[K6 + i - 6] = DEGREE >= 3 ? k[i * step] : (VF)(0.0f);
   const int *box = (const int *)block, *show = (const int *)&visible;
   const int *bucket_of = (const int *)&bucket_number;
   const uint *key = (const uint *)&ordered;
