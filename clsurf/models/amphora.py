@@ -31,7 +31,7 @@ _INSIDE = ((0.142, 1.072), (0.100, 1.010), (0.078, 0.950), (0.076, 0.900))
 _FLOOR = ((0.076, 0.900), (0.040, 0.890), (0.0, 0.888))
 _HANDLE = ((0.098, 0.945), (0.200, 0.985), (0.290, 0.960), (0.325, 0.870), (0.300, 0.770), (0.255, 0.715))
 
-_FLUTES, _BEADS, _KEYS = 36, 56, 14
+_FLUTES, _BEADS, _KEYS, _TONGUES = 36, 56, 14, 18
 _BAND = (0.470, 0.626)  # heights between which the meander runs
 _KEY = (((0, 0), (5, 0)), ((0, 0), (0, 4)), ((0, 4), (3.7, 4)), ((3.7, 4), (3.7, 1.3)), ((3.7, 1.3), (1.3, 1.3)),
         ((1.3, 1.3), (1.3, 2.7)), ((1.3, 2.7), (2.4, 2.7)))  # one unit of the meander, five stroke distances wide
@@ -81,15 +81,14 @@ def _curve(profile) -> CubicSpline:
 
 
 def _revolved(profile):
-    """Return the surface of revolution of `profile`, pushed outwards by the relief; d/ds x d/dt points outwards."""
-    curve = _curve(profile)
-    relief = profile is _BODY
+    """Return the surface of revolution of `profile`, pushed outwards by its relief; d/ds x d/dt points outwards."""
+    curve, relief = _curve(profile), {_BODY: _relief, _NECK: _tongues}.get(profile)
 
     def surface(s, t):
         radius, height = curve(s).T
         angle = -2 * np.pi * t
-        if relief:
-            radius = radius + _relief(height, -t % 1)
+        if relief is not None:
+            radius = radius + relief(height, -t % 1)
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
 
     return surface
@@ -105,6 +104,13 @@ def _relief(height: NDArray, turn: NDArray) -> NDArray:
     beads = 0.009 * np.sqrt(np.clip(1 - across**2 - along**2, 0, None) + 1e-4)
     rings = sum(0.005 * np.exp(-((height - at) / 0.0045) ** 2) for at in (0.440, 0.656, 0.678, 0.722))
     return flutes + meander + beads - 0.00009 + rings
+
+
+def _tongues(height: NDArray, turn: NDArray) -> NDArray:
+    """Return how far the tongues on the neck stand out: 0.004 with steep sides and a round end."""
+    across = np.abs((turn * _TONGUES) % 1 - 0.5) * 2
+    top = 0.985 + 0.02 * np.sqrt(1 - across**2)
+    return 0.004 * (1 - _step(across, 0.45, 0.75)) * _step(height, 0.868, 0.876) * (1 - _step(height, top - 0.004, top))
 
 
 def _meander(height: NDArray, turn: NDArray) -> NDArray:
@@ -185,10 +191,7 @@ def _paint_body(points: NDArray, s: NDArray, t: NDArray) -> NDArray:
 
 def _paint_neck(points: NDArray, s: NDArray, t: NDArray) -> NDArray:
     """Return black tongues on clay."""
-    across = np.abs((t * 20) % 1 - 0.5) * 2
-    top = 0.985 + 0.02 * np.sqrt(1 - across**2)
-    tongue = (across < 0.62) & (points[:, 2] > 0.872) & (points[:, 2] < top)
-    return _mix(np.asarray(_CLAY), np.asarray(_BLACK), tongue.astype(float))
+    return _mix(np.asarray(_CLAY), np.asarray(_BLACK), _step(_tongues(points[:, 2], -t % 1) / 0.004, 0.4, 0.6))
 
 
 def _paint_handle(points: NDArray, s: NDArray, t: NDArray) -> NDArray:
