@@ -14,7 +14,9 @@ from .orientation import oriented_to, signs_of, voxel_means
 ORIENTS = ("auto", "scanners", "graph", "up")
 LIDAR_ATTRIBUTES = {"classification", "return_number", "number_of_returns", "scan_angle", "scan_angle_rank"}
 NOISY = 0.38  # see _suitable_k
-VOXEL = 6.0  # over the k-th distance / sqrt(k): about 3.4 point spacings, 1.5 times the 16th distance
+# Side of a voxel over (k-th distance / sqrt(k)): about 2.8 point spacings, 1.25 times the 16th distance. 4, 5, 6, 8:
+# raw scans 0.97, 0.99, 1.02, 1.10 % wrong with 385, 250, 174, 97 thousand voxels.
+VOXEL = 5.0
 FLAT = 0.3  # height over extent below which a lidar cloud is seen from above
 
 
