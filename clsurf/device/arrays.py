@@ -5,6 +5,7 @@ blocks come from mmap with huge pages and are kept for reuse: fresh pages cost m
 4 KB pages: about 8 ms here).
 """
 
+import math
 import mmap
 import threading
 import weakref
@@ -82,7 +83,7 @@ class DeviceArray:
     @property
     def nbytes(self) -> int:
         """Bytes of the content."""
-        return int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+        return math.prod(self.shape) * self.dtype.itemsize
 
     def __len__(self):
         return self.shape[0]
@@ -99,13 +100,13 @@ def is_aligned(array: NDArray) -> bool:
 def new_array(context, pool: HostPool | None, shape, dtype, zero=False) -> DeviceArray:
     """Allocate a device array; `pool` is given on devices that share the host's memory."""
     dtype = np.dtype(dtype)
-    nbytes = max(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, 1)
+    nbytes = max(math.prod(shape) * dtype.itemsize, 1)
     if pool is None:
         return DeviceArray(cl.Buffer(context, cl.mem_flags.READ_WRITE, nbytes), shape, dtype)
     block = pool.take(nbytes)
     if zero:
         block.fill(0)
     buffer = cl.Buffer(context, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, hostbuf=block)
-    count = int(np.prod(shape, dtype=np.int64))
+    count = math.prod(shape)
     host = block[:count * dtype.itemsize].view(dtype).reshape(shape)
     return DeviceArray(buffer, shape, dtype, host)
