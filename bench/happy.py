@@ -1,15 +1,8 @@
 """The raw range images of the Happy Buddha: 1.1M points of 15 views, each with the direction to its sensor."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 
-
-def data_folder() -> Path:
-    """Return the folder of real scans: CLSURF_DATA, else `shared/data` beside the checkout."""
-    named = os.environ.get("CLSURF_DATA")
-    return Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
+from .scenes import data_folder
 
 
 def load_happy() -> tuple[np.ndarray, np.ndarray]:

@@ -1,40 +1,63 @@
-"""Normals: time and quality of `estimate_normals`, beside Open3D and SciPy where asked.
+"""The job `normals`: time and quality of `estimate_normals`, beside SciPy and, where it is installed, Open3D."""
 
-Run alone: python -m bench.normals [device]
-"""
-
-import json
-import sys
 import time
 
 import numpy as np
 
-from bench.happy import data_folder, load_happy
 from clsurf.build.normals import estimate_normals
-from clsurf.device import open_device
+from clsurf.device import Profile
 from clsurf.surface.cloud import PointCloud
 
+from . import peers, scenes
+from .build import WrongAnswer
+from .happy import load_happy
+from .table import print_table, profile_rows
 
-def run(device=None, quick=False, peers=False) -> dict:
-    """Measure normals of the dragon's vertices and of the raw happy scans.
+HAPPY = "range_scans/happy/happyStandRight.conf"
 
-    Parameters
-    ----------
-    device : optional
-    quick : bool
-        One run instead of the median of three.
-    peers : bool
-        Measure SciPy, and Open3D where it is installed, on the dragon as well.
+
+def measure(device, quick: bool = False, profile: bool = False) -> dict:
+    """Return the figures of normals; `device` is an opened one.
 
     Returns
     -------
     dict
-        Per scene: count, seconds, points per second and quality. Angles are in degrees; `wrong` is the share of normals
-        whose sign disagrees with the mesh's normal (dragon) or the own range image's sensor direction (happy).
+        Per scene: count, seconds (median of three after a first run) and quality. Angles are in degrees; ``wrong`` is
+        the share of normals whose sign disagrees with the mesh's normal, or, for the raw scans of happy, with the
+        direction to the sensor of their own range image.
     """
-    device = open_device(device)
     repeats = 1 if quick else 3
-    return {"dragon": _dragon(device, repeats, peers), "happy": _happy(device, repeats)}
+    name = scenes.chosen(("dragon",), quick)[0]
+    figures = {name: _vertices(scenes.scene(name).scan, device, repeats, with_peers=not quick)}
+    if not quick and (scenes.data_folder() / HAPPY).exists():
+        figures["happy"] = _happy(device, repeats)
+    elif not quick:
+        print("scans missing: happy (CLSURF_DATA names their folder)")
+    for label, found in figures.items():
+        if not found["wrong"] < 0.2:
+            raise WrongAnswer(f"bench normals {label}: expected under 20 % of wrong signs, got {found['wrong']:.1%}: "
+                              "mend the orientation before timing it")
+    show(figures)
+    if profile:
+        device.profile = Profile()
+        try:
+            estimate_normals(PointCloud(scenes.scene(name).scan.vertices), device=device)
+            print(f"\nstages of the normals of {name} (each launch waits for the one before)")
+            print_table(("kernel or stage", "calls", "min ms", "median ms", "share"), profile_rows(device.profile))
+        finally:
+            device.profile = None
+    return figures
+
+
+def show(figures: dict) -> None:
+    """Print the figures."""
+    rows = []
+    for name, found in figures.items():
+        for label, part in ((name, found), *((f"  {peer}", part) for peer, part in found.get("peers", {}).items())):
+            whole, bare, angle = (part.get(key) for key in ("seconds", "seconds_without_orientation", "median_angle"))
+            rows.append((label, f"{found['count']:,}", f"{whole:.2f}" if whole else "-", f"{bare:.2f}" if bare else "-",
+                         f"{part['wrong']:.2%}" if whole else "-", f"{angle:.2f}" if angle is not None else "-"))
+    print_table(("scene", "points", "s", "s unoriented", "wrong", "median deg"), rows)
 
 
 def _timed(function, repeats):
@@ -48,17 +71,14 @@ def _timed(function, repeats):
     return float(np.median(seconds)), result
 
 
-def _dragon(device, repeats, peers) -> dict:
-    import trimesh
-
-    mesh = trimesh.load(data_folder() / "dragon" / "dragon.ply", process=False)
-    points, truth = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.vertex_normals)
+def _vertices(mesh, device, repeats, with_peers) -> dict:
+    points, truth = np.asarray(mesh.vertices), np.asarray(mesh.normals, np.float64)
     cloud = PointCloud(points)
     seconds, result = _timed(lambda: estimate_normals(cloud, device=device), repeats)
     bare, _ = _timed(lambda: estimate_normals(cloud, orient=None, device=device), repeats)
-    out = {"scene": "dragon, vertices", "count": len(points), "seconds": seconds, "seconds_without_orientation": bare,
+    out = {"count": len(points), "seconds": seconds, "seconds_without_orientation": bare,
            **_compared(result.normals, truth)}
-    if peers:
+    if with_peers:
         out["peers"] = {"scipy": _scipy(points, truth), **_open3d(points, truth, repeats)}
     return out
 
@@ -75,8 +95,7 @@ def _happy(device, repeats) -> dict:
     cloud = PointCloud(points)
     seconds, result = _timed(lambda: estimate_normals(cloud, device=device), repeats)
     wrong = np.einsum("ij,ij->i", result.normals, sensor) < 0
-    return {"scene": "happy, 15 raw range images", "count": len(points), "seconds": seconds,
-            "wrong": float(wrong.mean())}
+    return {"count": len(points), "seconds": seconds, "wrong": float(wrong.mean())}
 
 
 def _scipy(points, truth) -> dict:
@@ -91,9 +110,9 @@ def _scipy(points, truth) -> dict:
 
 
 def _open3d(points, truth, repeats) -> dict:
-    try:
-        import open3d
-    except ImportError:
+    open3d = peers.open3d()
+    if open3d is None:
+        print("peer Open3D: not installed (pip install clsurf[bench])")
         return {}
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
     search = open3d.geometry.KDTreeSearchParamKNN(16)
@@ -103,7 +122,3 @@ def _open3d(points, truth, repeats) -> dict:
     orientation = time.perf_counter() - start
     return {"open3d": {"seconds_without_orientation": bare, "seconds": bare + orientation,
                        **_compared(np.asarray(cloud.normals), truth)}}
-
-
-if __name__ == "__main__":
-    print(json.dumps(run(sys.argv[1] if len(sys.argv) > 1 else None, peers="--peers" in sys.argv), indent=1))

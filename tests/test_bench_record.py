@@ -98,7 +98,7 @@ def test_sharp_edges_of_a_box():
     assert np.allclose(away, [0.0, 0.5])
 
 
-@pytest.mark.parametrize("job", ["build", "tiles"])
+@pytest.mark.parametrize("job", ["build", "tiles", "normals"])
 def test_quick_jobs_check_and_measure(job, device, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     found = bench.run(job, device=device, json_path=tmp_path / "figures.json", quick=True, profile=True)
@@ -109,6 +109,8 @@ def test_quick_jobs_check_and_measure(job, device, tmp_path, monkeypatch, capsys
         assert found["figures"]["pictures"]["generated"]["worst_holes"] == 0
         assert found["figures"]["frames"]["generated 500"]["frame"]["median_s"] > 0
         assert "tile_slim" in found["figures"]["frames"]["generated 500"]["stages"]
+    elif job == "normals":
+        assert found["figures"]["generated"]["wrong"] == 0
     else:
         generated = found["figures"]["generated"]
         assert generated["rms_percent"] < 0.1 and generated["build"]["median_s"] > 0
