@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 
-from .lattice import area_of, points_on
+from .lattice import area_density, points_on
 
 # sRGB
 _CLAY, _LIGHT, _BLACK, _CREAM = ((0.80, 0.42, 0.22), (0.88, 0.55, 0.32), (0.13, 0.115, 0.12), (0.93, 0.84, 0.68))
@@ -31,7 +31,8 @@ _INSIDE = ((0.142, 1.072), (0.100, 1.010), (0.078, 0.950), (0.076, 0.900))
 _FLOOR = ((0.076, 0.900), (0.040, 0.890), (0.0, 0.888))
 _HANDLE = ((0.098, 0.945), (0.200, 0.985), (0.290, 0.960), (0.325, 0.870), (0.300, 0.770), (0.255, 0.715))
 
-_FLUTES, _BEADS, _KEYS, _TONGUES = 36, 56, 14, 18
+_FLUTES, _BEADS, _KEYS, _TONGUES = 36, 44, 14, 18
+_BEAD = 0.0125  # radius; five point spacings across at 100,000 points
 _BAND = (0.470, 0.626)  # heights between which the meander runs
 _KEY = (((0, 0), (5, 0)), ((0, 0), (0, 4)), ((0, 4), (3.7, 4)), ((3.7, 4), (3.7, 1.3)), ((3.7, 1.3), (1.3, 1.3)),
         ((1.3, 1.3), (1.3, 2.7)), ((1.3, 2.7), (2.4, 2.7)))  # one unit of the meander, five stroke distances wide
@@ -55,13 +56,17 @@ def demo_scan(n: int = 100_000) -> PointCloud:
         (_COLLAR, _plain(_BLACK)), (_NECK, _paint_neck), (_LIP, _plain(_BLACK)), (_RIM, _plain(_CLAY)),
         (_INSIDE, _plain(_BLACK)), (_FLOOR, _plain(_BLACK)))]
     pieces += [(_handle(side), _paint_handle) for side in (1, -1)]
-    areas = np.array([area_of(surface) for surface, _ in pieces])
+    densities = [area_density(surface) for surface, _ in pieces]
+    areas = np.array([density.mean() for density in densities])
     counts = np.ceil(1.015 * n * areas / areas.sum()).astype(int)  # 1.5 % end up inside another piece
     tree = _handle_axes()
     points, normals, colors = [], [], []
-    for (surface, paint), count in zip(pieces, counts, strict=True):
-        p, normal, s, t = points_on(surface, count)
-        seen = ~_inside_body(p) if paint is _paint_handle else tree.query(p)[0] > 0.85 * _TUBE
+    for (surface, paint), density, count in zip(pieces, densities, counts, strict=True):
+        p, normal, s, t = points_on(surface, count, density)
+        if paint is _paint_handle:
+            seen = ~_inside_body(p)
+        else:
+            seen = np.isinf(tree.query(p, distance_upper_bound=0.85 * _TUBE)[0])  # the bound halves the whole
         points.append(p[seen])
         normals.append(normal[seen])
         colors.append(paint(p[seen], s[seen], t[seen]))
@@ -99,11 +104,16 @@ def _relief(height: NDArray, turn: NDArray) -> NDArray:
     fade = _step(height, 0.105, 0.150) * (1 - _step(height, 0.400, 0.425))
     flutes = -0.011 * fade * np.abs(np.sin(np.pi * _FLUTES * turn)) * _step(height, 0.05, 0.35)
     meander = 0.0075 * _meander(height, turn)
-    across = (height - 0.700) / 0.0085
-    along = ((turn * _BEADS) % 1 - 0.5) * 2 * np.pi * 0.31 / _BEADS / 0.0095
-    beads = 0.009 * np.sqrt(np.clip(1 - across**2 - along**2, 0, None) + 1e-4)
-    rings = sum(0.005 * np.exp(-((height - at) / 0.0045) ** 2) for at in (0.440, 0.656, 0.678, 0.722))
-    return flutes + meander + beads - 0.00009 + rings
+    beads = 0.010 * np.clip(1 - _bead(height, turn), 0, None)
+    rings = sum(0.005 * np.exp(-((height - at) / 0.0045) ** 2) for at in (0.440, 0.652, 0.672, 0.728))
+    return flutes + meander + beads + rings
+
+
+def _bead(height: NDArray, turn: NDArray) -> NDArray:
+    """Return the squared distance to the nearest bead's middle over the bead's radius."""
+    across = height - 0.700
+    along = ((turn * _BEADS) % 1 - 0.5) * 2 * np.pi * 0.313 / _BEADS
+    return (across**2 + along**2) / _BEAD**2
 
 
 def _tongues(height: NDArray, turn: NDArray) -> NDArray:
@@ -182,11 +192,9 @@ def _paint_body(points: NDArray, s: NDArray, t: NDArray) -> NDArray:
     ridge = np.abs(np.sin(np.pi * _FLUTES * turn))
     color = _mix(color, _mix(_LIGHT, _BLACK, _step(ridge, 0.15, 0.45)), (height < 0.430).astype(float))
     color = _mix(color, np.asarray(_BLACK), _meander(height, turn))
-    for low, high in ((0.430, 0.450), (0.647, 0.686), (0.714, 0.730), (0.80, 0.85)):
+    for low, high in ((0.430, 0.450), (0.643, 0.681), (0.719, 0.737), (0.80, 0.85)):
         color = _mix(color, np.asarray(_BLACK), ((height > low) & (height < high)).astype(float))
-    across = (height - 0.700) / 0.0085
-    along = ((turn * _BEADS) % 1 - 0.5) * 2 * np.pi * 0.31 / _BEADS / 0.0095
-    return _mix(color, np.asarray(_CREAM), (across**2 + along**2 < 1.1).astype(float))
+    return _mix(color, np.asarray(_CREAM), (_bead(height, turn) < 1).astype(float))
 
 
 def _paint_neck(points: NDArray, s: NDArray, t: NDArray) -> NDArray:

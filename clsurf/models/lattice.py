@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 GOLDEN = (5 ** 0.5 - 1) / 2
-_GRID = 257  # samples a side of the area density; the shapes here change over a tenth of that or more
+_GRID = 129  # samples a side of the area density
 _STEP = 1e-6  # of the parameter range; central differences in float64 are then good to 1e-9
 
 
-def points_on(surface: Callable, count: int, around: bool = True) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def points_on(surface: Callable, count: int,
+              density: NDArray | None = None) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Spread `count` points evenly over the surface and return them with exact normals.
 
     Parameters
@@ -18,8 +19,8 @@ def points_on(surface: Callable, count: int, around: bool = True) -> tuple[NDArr
     surface : callable
         Maps s, t (both (n,) float64 in [0, 1]) to positions (n, 3); smooth, and defined a little beyond the square.
     count : int
-    around : bool
-        t runs around a closed curve.
+    density : NDArray, optional
+        `area_density` of the surface, where it is at hand.
 
     Returns
     -------
@@ -35,28 +36,22 @@ def points_on(surface: Callable, count: int, around: bool = True) -> tuple[NDArr
     """
     i = np.arange(count)
     a, b = (i + 0.5) / count, (i * GOLDEN + 0.5) % 1
-    s, t = _area_to_parameters(surface, a, b)
+    s, t = _area_to_parameters(area_density(surface) if density is None else density, a, b)
     points = surface(s, t)
     normals = np.cross(_derivative(surface, s, t, 0), _derivative(surface, s, t, 1))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return points, normals, s, t if not around else t % 1
+    return points, normals, s, t
 
 
-def area_of(surface: Callable) -> float:
-    """Return the area of a parametric surface over the unit square."""
-    return float(_densities(surface).mean())
-
-
-def _densities(surface: Callable) -> NDArray:
-    """Return the area per unit of s and t at the middles of a grid, (grid, grid) float64."""
+def area_density(surface: Callable) -> NDArray:
+    """Return the area per unit of s and t at the middles of a grid, (grid, grid) float64; its mean is the area."""
     middles = (np.arange(_GRID) + 0.5) / _GRID
     s, t = (m.ravel() for m in np.meshgrid(middles, middles, indexing="ij"))
     area = np.cross(_derivative(surface, s, t, 0), _derivative(surface, s, t, 1))
     return np.linalg.norm(area, axis=1).reshape(_GRID, _GRID)
 
 
-def _area_to_parameters(surface: Callable, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
-    density = _densities(surface)
+def _area_to_parameters(density: NDArray, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     edges = np.arange(_GRID + 1) / _GRID
     rows = np.append(0, np.cumsum(density.sum(axis=1)))
     s = np.interp(a, rows / rows[-1], edges)
