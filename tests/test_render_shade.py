@@ -103,7 +103,8 @@ def test_options_are_checked(device):
     ball = sphere(20)
     with Renderer(device) as r:
         for bad in (dict(size=(0, 5)), dict(size=(5.5, 5)), dict(size=5), dict(size=(70000, 5)),
-                    dict(channels=("colour",)), dict(channels=()), dict(lod=-1), dict(lod=np.nan), dict(background=(1, 1)), dict(shading="shiny")):
+                    dict(channels=("colour",)), dict(channels=()), dict(lod=-1),
+                    dict(lod=np.nan), dict(background=(1, 1)), dict(shading="shiny")):
             with pytest.raises(InputError):
                 r.render(ball, **({"size": (8, 8)} | bad))
         with pytest.raises(InputError, match="build_slim"):

@@ -4,6 +4,7 @@ A tile, the unit of work of the tile stages, is a square of bins. Every represen
 bin) with `bin_pairs` and writes the same planes, so that surfaces of all kinds meet in one z-buffer.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -184,7 +185,7 @@ class Scratch:
 
     def array(self, name: str, shape: tuple, dtype) -> DeviceArray:
         """Return an array of undefined content, valid until the same name is asked for again."""
-        nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        nbytes = math.prod(shape) * np.dtype(dtype).itemsize
         kept = self._kept.get(name)
         if kept is None or kept.nbytes < nbytes:
             self._kept.pop(name, None)

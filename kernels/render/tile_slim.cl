@@ -49,10 +49,14 @@ INLINE VI inside_footprint(uint lo, uint hi, VF u, VF v) {
 
 #if VW == 1
 #define PAIRS __global const uint2 *
+#define AT_ONCE 1
 #define SKIP(pair, bits) if (!((pair).y & (bits))) continue;
 #else
 // The pairs of one block, a segment of the bin's list at a time: what remains has no unpredictable branch.
 #define PAIRS const uint2 *
+#ifndef AT_ONCE
+#define AT_ONCE 2
+#endif
 #define SKIP(pair, bits)
 #define SEGMENT 256
 INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *kept) {
@@ -104,37 +108,36 @@ INLINE void frontmost_root(__global const float *k, RayPoly p, uint index, float
 INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global const float *records, VF px, VF py,
                      VF low, VF *z, VF *hit, VF *facing, VI *nearest, int *cost) {
   int more = 1;
-  for (int e = 0; e < count; e++) {
-    uint2 pair = pairs[e];
-    SKIP(pair, block)
-    float near = near_of_key(pair.y);
-    if (!any_lane(near < *z)) {
-      // Pairs behind are at most a bucket nearer; PoCL is slower with a break.
-      if (!any_lane(near - bucket < *z)) { count = 0; more = 0; }
-      continue;
+  for (int e = 0; e < count; e += AT_ONCE) {
+    float near = near_of_key(pairs[e].y);
+    if (!any_lane(near - bucket < *z)) { count = 0; more = 0; continue; }  // PoCL is slower with a break
+    // The test waits for the hits before it; one test for two pairs lets their arithmetic overlap.
+    for (int i = 0; i < AT_ONCE; i++) {
+      uint2 pair = pairs[e + i < count ? e + i : e];
+      SKIP(pair, block)
+      __global const float *k = records + (size_t)INDEX_OF(pair) * RECORD_FLOATS;
+      VF x = px - k[XR], y = py - k[YR];
+      VF u = k[U0] + k[UX] * x + k[UY] * y, v = k[V0] + k[VX] * x + k[VY] * y, w = k[W0] + k[WX] * x + k[WY] * y;
+      VF du = k[DU] + k[INV_T] * u, dv = k[DV] + k[INV_T] * v, dw = k[DW] + k[INV_T] * w;
+      RayPoly p = ray_poly(k, u, v, w, du, dv, dw);
+      if (pair.x & SEEN_FRONT) frontmost_root(k, p, INDEX_OF(pair), 1.0f, u, v, w, du, dv, dw, low, z, hit, facing, nearest);
+      if (pair.x & SEEN_BACK) frontmost_root(k, p, INDEX_OF(pair), -1.0f, u, v, w, du, dv, dw, low, z, hit, facing, nearest);
+      *cost += 1;
     }
-    __global const float *k = records + (size_t)INDEX_OF(pair) * RECORD_FLOATS;
-    VF x = px - k[XR], y = py - k[YR];
-    VF u = k[U0] + k[UX] * x + k[UY] * y, v = k[V0] + k[VX] * x + k[VY] * y, w = k[W0] + k[WX] * x + k[WY] * y;
-    VF du = k[DU] + k[INV_T] * u, dv = k[DV] + k[INV_T] * v, dw = k[DW] + k[INV_T] * w;
-    RayPoly p = ray_poly(k, u, v, w, du, dv, dw);
-    if (pair.x & SEEN_FRONT) frontmost_root(k, p, INDEX_OF(pair), 1.0f, u, v, w, du, dv, dw, low, z, hit, facing, nearest);
-    if (pair.x & SEEN_BACK) frontmost_root(k, p, INDEX_OF(pair), -1.0f, u, v, w, du, dv, dw, low, z, hit, facing, nearest);
-    *cost += 1;
   }
   return more;
 }
 
-// Pass 2: add the surfels whose ball holds the point at depth `hit` (INFINITY: no point); all points lie in [least, most].
+// Pass 2: add the surfels whose ball holds the point at depth `hit` (INFINITY: no point).
 INLINE void blend(PAIRS pairs, int count, uint block, __global const float *records, __global const float4 *colors,
-                  VF px, VF py, VF hit, float least, float most, VF facing, Blend *sum, int *cost) {
+                  VF px, VF py, VF hit, VF facing, Blend *sum, int *cost) {
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
     SKIP(pair, block)
     uint index = INDEX_OF(pair);
     __global const float *k = records + (size_t)index * RECORD_FLOATS;
-    if (k[T_REF] - k[REACH] > most || k[T_REF] + k[REACH] < least) continue;
     VF s = hit - k[T_REF];
+    if (!any_lane((s < k[REACH]) & (s > -k[REACH]))) continue;
     VF x = px - k[XR], y = py - k[YR], step, slope;
     VF u = k[U0] + k[UX] * x + k[UY] * y, v = k[V0] + k[VX] * x + k[VY] * y, w = k[W0] + k[WX] * x + k[WY] * y;
     VF du = k[DU] + k[INV_T] * u, dv = k[DV] + k[INV_T] * v, dw = k[DW] + k[INV_T] * w;
@@ -171,17 +174,6 @@ INLINE void blend(PAIRS pairs, int count, uint block, __global const float *reco
   }
 }
 
-// Least and largest of the finite lanes; there is one.
-INLINE void range_of(VF hit, float *least, float *most) {
-  VF finite = SEL(hit, (VF)(-INFINITY), hit == INFINITY);
-  const float *a = (const float *)&hit, *b = (const float *)&finite;
-  *least = a[0]; *most = b[0];
-  for (int i = 1; i < VW; i++) {
-    *least = a[i] < *least ? a[i] : *least;
-    *most = b[i] > *most ? b[i] : *most;
-  }
-}
-
 // One block (VW = 1: one pixel) of a bin.
 INLINE int draw_block(__global const float *view, __global const uint2 *pairs, int count, uint quarter,
                       __global const float *records, __global const float4 *colors, __global const int *levels,
@@ -212,17 +204,15 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
 #endif
     VI found = hit < infinite;
     if (!any_lane(found)) break;
-    float least, most;
-    range_of(hit, &least, &most);
     Blend sum;
     sum.depth = sum.weight = sum.fx = sum.fy = sum.ft = sum.red = sum.green = sum.blue = 0.0f;
     sum.nearest = 0; sum.number = 0;
 #if VW == 1
-    blend(pairs, count, 1u << quarter, records, colors, px, py, hit, least, most, facing, &sum, &cost);
+    blend(pairs, count, 1u << quarter, records, colors, px, py, hit, facing, &sum, &cost);
 #else
     for (int first = 0; first < count; first += SEGMENT) {
       int n = filtered(pairs + first, count - first < SEGMENT ? count - first : SEGMENT, quarter, kept);
-      blend(kept, n, 0u, records, colors, px, py, hit, least, most, facing, &sum, &cost);
+      blend(kept, n, 0u, records, colors, px, py, hit, facing, &sum, &cost);
     }
 #endif
     found = found & (sum.weight > 0.0f);
