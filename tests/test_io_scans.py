@@ -287,6 +287,28 @@ def test_las_with_eight_bit_colours(tmp_path):
     assert load(tmp_path / "a.las").colors[:, 0].tolist() == [0, 100, 200, 255]
 
 
+@pytest.mark.parametrize("at, value", [
+    (100, 2**32 - 1),  # records: laspy would read on for hours
+    (247, 2**40),  # points
+    ("table", 2**31),  # chunks: the decoder would end the process
+    ("layer", 2**32 - 1),  # bytes of the first layer of the first chunk
+])
+def test_las_counts_are_checked_first(tmp_path, at, value):
+    path = tmp_path / "a.laz"
+    save(make_cloud(), path)
+    data = bytearray(path.read_bytes())
+    points = struct.unpack("<I", data[96:100])[0]
+    if at == "table":
+        at = struct.unpack("<q", data[points:points + 8])[0] + 4
+    elif at == "layer":
+        at = points + 8 + struct.unpack("<H", data[105:107])[0] + 4
+    data[at:at + 4 + 4 * (at == 247)] = value.to_bytes(4 + 4 * (at == 247), "little")
+    path.write_bytes(data)
+    start = time.perf_counter()
+    load_scan_fails(path)
+    assert time.perf_counter() - start < 2
+
+
 def test_glb_scene_is_placed_and_put_together(tmp_path):
     import trimesh
     scene = trimesh.Scene()

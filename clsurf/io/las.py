@@ -4,6 +4,7 @@ import struct
 from pathlib import Path
 
 import laspy
+import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,7 @@ from .files import one_line
 _KEPT = ("intensity", "classification")  # other dimensions are dropped: nothing here reads them
 _SMALLEST_LAZ_POINT = 1 / 64  # bytes; laszip's chunks of equal points do not go below
 _SMALLEST_CHUNK = 20  # bytes; a chunk starts with a point as it is
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of point, colour, colour + infrared, wave packet; 14, bytes: one for each
 _BLOCK = 2_000_000  # points decoded at once: autzen's 10.7 million peak at 0.6 GB instead of 1.1
 
 
@@ -127,6 +129,30 @@ def _check_counts(path: Path, header) -> None:
         chunks = int.from_bytes(file.read(4), "little")
     if chunks * _SMALLEST_CHUNK > size:
         raise FileFormatError(f"{path}: damaged: {chunks:,} chunks of points do not fit in {size:,} bytes")
+    _check_chunks(path, header, size)
+
+
+def _check_chunks(path: Path, header, size: int) -> None:
+    """Refuse chunks, and layers within them (point formats 6 to 10), whose lengths add up to more than the file."""
+    record = next(vlr for vlr in header.vlrs if vlr.record_id == 22204).record_data_bytes()
+    compressor, items = struct.unpack("<H", record[:2])[0], struct.unpack("<H", record[32:34])[0]
+    kinds = [struct.unpack("<HH", record[34 + 6 * i:38 + 6 * i]) for i in range(items)]
+    layers = sum(width if kind == 14 else _LAYERS.get(kind, 0) for kind, width in kinds) if compressor == 3 else 0
+    width, at = sum(width for _, width in kinds), header.offset_to_point_data
+    with open(path, "rb") as file:
+        file.seek(at)
+        table = lazrs.read_chunk_table(file, lazrs.LazVlr(record)) or []
+        at += 8
+        if at + sum(length for _, length in table) > size or sum(points for points, _ in table) < header.point_count:
+            raise FileFormatError(f"{path}: truncated: its {len(table):,} chunks do not hold the "
+                                  f"{header.point_count:,} points of its header in {size:,} bytes")
+        for _, length in table if layers else ():
+            file.seek(at + width)
+            sizes = np.frombuffer(file.read(4 * layers + 4), "<u4")[1:]
+            if len(sizes) < layers or int(sizes.sum(dtype=np.int64)) > length:
+                raise FileFormatError(f"{path}: damaged: a chunk of {length:,} bytes has layers of "
+                                      f"{int(sizes.sum(dtype=np.int64)):,} bytes")
+            at += length
 
 
 def write_las(scan, path: Path) -> None:
