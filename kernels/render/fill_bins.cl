@@ -8,15 +8,19 @@ __kernel void fill_bins(__global const uint *order, __global const uint *depth_o
   int part = get_global_id(0), count = depth_offsets[DEPTH_BUCKETS], chunk = (count + parts - 1) / parts;
   int begin = part * chunk, end = begin + chunk < count ? begin + chunk : count;
   __global uint *mine = counts + (size_t)part * bin_count;
+  if (begin >= end) return;
+  for (int i = 0; i < bin_count; i++) mine[i] += offsets[i];  // one scattered read a pair less
   for (int i = begin; i < end; i++) {
     uint index = order[i];
     short4 r = full[index], c = core[index];
     uint key = keys[index] & 0xffffff00u;
     index |= (keys[index] & 3u) << 30;
-    for (int y = r.y >> 1; y <= r.w >> 1; y++)
+    for (int y = r.y >> 1; y <= r.w >> 1; y++) {
+      uint row = rows_of(r.y, r.w, y), core_row = rows_of(c.y, c.w, y);
       for (int x = r.x >> 1; x <= r.z >> 1; x++) {
-        int bin = y * bins_x + x;
-        pairs[offsets[bin] + mine[bin]++] = (uint2)(index, key | block_bits(c, x, y) << 4 | block_bits(r, x, y));
+        uint bits = (core_row & columns_of(c.x, c.z, x)) << 4 | (row & columns_of(r.x, r.z, x));
+        pairs[mine[y * bins_x + x]++] = (uint2)(index, key | bits);
       }
+    }
   }
 }
