@@ -1,7 +1,7 @@
 """The job `tiles`: pictures of SLIM surfaces. Faults against ray casting, time a frame, a stage, a tile; peers.
 
 A frame time is `Renderer.render` to host arrays of colour, depth and normal, the camera orbiting by 1 degree a frame,
-nothing view-dependent kept. All cases and peers take turns, in blocks of a few frames, within one run.
+nothing view-dependent kept. All cases and peers take turns within one run, in blocks of frames.
 """
 
 import itertools
@@ -19,7 +19,10 @@ from .table import print_table
 
 CHANNELS = ("color", "depth", "normal")
 TILE = 32  # pixels across the squares that the cost of tiles is summed over
-BLOCK = 4  # frames of one case before the next one's turn
+BLOCK = 8  # frames of one case before the next one's turn
+# Frames before each block that do not count: after another program's turn the first frame took 1.7 times as long (cold
+# caches, buffers of another size), the third as long as all that follow.
+WARM = 2
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ def faults(scene, surface, device, size=(1024, 1024), lod: float = 4.0, count: i
 def frames(cases, surfaces, device, count: int, with_peers: bool = True) -> dict:
     """Return the frame times of every case, and those of the peers on the same cameras."""
     runners = {case.name: _clsurf_runner(case, surfaces[case.scene, case.degree], device) for case in cases}
-    orbits = {case.name: case.cameras(count) for case in cases}
+    orbits = {case.name: case.cameras(count + WARM) for case in cases}
     plain = [case for case in cases if case.degree == 2 and case.lod == 4.0]
     closers = []
     if with_peers:
@@ -117,8 +120,8 @@ def frames(cases, surfaces, device, count: int, with_peers: bool = True) -> dict
             run(camera)
     for start in range(0, count, BLOCK):
         for key, run in runners.items():
-            cameras = orbits[key if isinstance(key, str) else key[0]]
-            seconds[key] += [run(camera) for camera in cameras[start:start + BLOCK]]
+            cameras = orbits[key if isinstance(key, str) else key[0]][start:start + WARM + BLOCK]
+            seconds[key] += [run(camera) for camera in cameras][WARM:]
     for window in closers:
         window.close()
     found = {case.name: {"frame": record.timing(seconds[case.name])} for case in cases}
