@@ -198,6 +198,12 @@ def test_ply_triangle_strips(tmp_path, form, order):
     assert load(tmp_path / "a.ply").faces.tolist() == [[0, 1, 2], [1, 3, 2], [4, 2, 1]]
 
 
+def test_off_with_comments_polygons_and_face_colours(tmp_path):
+    (tmp_path / "a.off").write_text("OFF # a comment\n# another\n5 2 0\n\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 1 # top\n"
+                                    "4 0 1 2 3 255 0 0\n3 0 1 4\n")
+    assert load(tmp_path / "a.off").faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
+
+
 def test_range_grid_is_a_cloud(tmp_path):
     text = ("ply\nformat ascii 1.0\nobj_info num_cols 2\nelement vertex 3\nproperty float x\nproperty float y\n"
             "property float z\nelement range_grid 4\nproperty list uchar int vertex_indices\nend_header\n"
@@ -521,3 +527,17 @@ def test_generated_scan_goes_round(tmp_path):
     save(scan, tmp_path / "a.ply")
     again = load(tmp_path / "a.ply")
     assert (again.points == scan.points).all() and (again.colors == scan.colors).all()
+
+
+def test_draco_without_its_decoder(tmp_path, monkeypatch):
+    """Trimesh would give a mesh of zeros."""
+    import json
+    import sys
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    text = json.dumps({"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]}).encode()
+    text += b" " * (-len(text) % 4)
+    (tmp_path / "a.glb").write_bytes(struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text)
+    (tmp_path / "b.gltf").write_bytes(text)
+    for name in ("a.glb", "b.gltf"):
+        with pytest.raises(FileFormatError, match="pip install DracoPy"):
+            load(tmp_path / name)

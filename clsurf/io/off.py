@@ -14,7 +14,7 @@ from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
 from .colors import as_rgba8
-from .rows import digits_of, world_of, write_rows
+from .rows import digits_of, numbers_in, world_of, write_rows
 
 
 def read_off(path: Path) -> Mesh | PointCloud:
@@ -29,7 +29,8 @@ def read_off(path: Path) -> Mesh | PointCloud:
     match = re.match(rb"\s*(ST)?(C)?(N)?(4)?OFF\b(\s+BINARY)?", data)
     if match is None or match[4] or match[5]:
         raise FileFormatError(f"{path}: expected a text file that starts with OFF, got {data[:16]!r}")
-    lines = [line for line in (re.sub(rb"#.*", b"", line).strip() for line in data[match.end():].splitlines()) if line]
+    body = re.sub(rb"#[^\r\n]*", b"", data[match.end():]) if b"#" in data else data[match.end():]
+    lines = [line for line in map(bytes.strip, body.splitlines()) if line]
     counts = lines[0].split() if lines else []
     if len(counts) < 2 or not all(word.isdigit() for word in counts[:2]):
         raise FileFormatError(f"{path}: expected the counts of vertices and faces, got {b' '.join(counts)[:60]!r}")
@@ -55,14 +56,17 @@ def read_off(path: Path) -> Mesh | PointCloud:
 
 
 def _table(path: Path, lines: list[bytes]) -> NDArray:
-    rows = [line.split() for line in lines]
-    width = len(rows[0]) if rows else 3
-    if width < 3 or any(len(row) != width for row in rows):
+    width = len(lines[0].split()) if lines else 3
+    table = numbers_in(b"\n".join(lines))
+    if width < 3 or len(table) != width * len(lines):
         raise FileFormatError(f"{path}: expected vertices of at least three numbers, all of one length")
-    return np.array(rows, dtype=bytes).astype(np.float64).reshape(-1, width)
+    return table.reshape(-1, width)
 
 
 def _triangles(path: Path, lines: list[bytes]) -> NDArray:
+    tokens = numbers_in(b"\n".join(lines))
+    if len(tokens) == 4 * len(lines) and (tokens[::4] == 3).all():  # triangles without colours
+        return np.clip(tokens.reshape(-1, 4)[:, 1:], -1, 2**31 - 1).astype(np.int64)
     out: list[tuple[int, int, int]] = []
     for line in lines:
         words = line.split()

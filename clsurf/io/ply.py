@@ -4,7 +4,6 @@ Own code because trimesh reads neither triangle strips nor range grids nor furth
 float64 and takes 0.8 s for a range image of 40,000 points. Source: Greg Turk, "The PLY Polygon File Format" (1994).
 """
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
 from .colors import as_rgba8
+from .rows import numbers_in
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -184,12 +184,10 @@ def _uniform_lists(data, at, element, order, chosen):
 
 def _read_ascii(path, data, start, elements, wanted, _order) -> dict:
     """Return the same as `_read_binary` for an ascii file."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # how NumPy tells of text that is no number
-        try:
-            tokens = np.fromstring(data[start:].decode("latin-1"), np.float64, sep=" ")
-        except (DeprecationWarning, ValueError):
-            raise FileFormatError(f"{path}: expected numbers after the header, got other text") from None
+    try:
+        tokens = numbers_in(data[start:])
+    except ValueError:
+        raise FileFormatError(f"{path}: expected numbers after the header, got other text") from None
     found, at = {}, 0
     for element in elements:
         if not wanted:
