@@ -21,6 +21,8 @@ inline void consider(__global const float *leaf, Queries *q, VF best[16 * CHUNKS
 #pragma unroll
   for (int c = 0; c < CHUNKS; c++) {
     VF *b = best + 16 * c;
+    // Most leaves after the first few change no or only the last chunk (K = 48: 4.2 -> 7.0 M points/s, 16: 10 -> 12).
+    if (!any_lane(d0 < b[15])) continue;
 #if CHUNKS > 1
     // The larger halves go on to the next chunk.
 #define LARGER(i) VF l##i; 
@@ -84,7 +86,7 @@ __kernel void knn_covariance(__global const VF *nodes, __global const float *lea
   VF best[16 * CHUNKS];
   for (int i = 0; i < 16 * CHUNKS; i++) best[i] = FAR;
   int start = starts[first / 16];
-  int low = start > 0 ? start - 1 : 0, high = start + 1 < leaf_count ? start + 1 : start;
+  int low = start > CHUNKS ? start - CHUNKS : 0, high = start + CHUNKS < leaf_count ? start + CHUNKS : leaf_count - 1;
   for (int leaf = low; leaf <= high; leaf++) consider(leaves + 48 * leaf, &q, best);
   Walk walk;
   walk.top = 1, walk.stack[0] = 0;

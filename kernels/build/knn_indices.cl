@@ -28,6 +28,7 @@ inline void consider(__global const float *leaf, int number, Queries *q, VF best
   for (int c = 0; c < CHUNKS; c++) {
     VF *b = best + 16 * c;
     VI *m = index + 16 * c;
+    if (!any_lane(d[0] < b[15])) continue;
     for (int i = 0; i < 16; i++) EXCHANGE_PAIR(b[i], m[i], d[15 - i], n[15 - i])
 #define EXCHANGE_BEST(i, j) EXCHANGE_PAIR(b[i], m[i], b[j], m[j])
     MERGE_16(EXCHANGE_BEST)
@@ -52,7 +53,7 @@ __kernel void knn_indices(__global const VF *nodes, __global const float *leaves
   VI index[16 * CHUNKS];
   for (int i = 0; i < 16 * CHUNKS; i++) best[i] = FAR, index[i] = 0x7fffffff;
   int start = starts[first / 16];
-  int low = start > 0 ? start - 1 : 0, high = start + 1 < leaf_count ? start + 1 : start;
+  int low = start > CHUNKS ? start - CHUNKS : 0, high = start + CHUNKS < leaf_count ? start + CHUNKS : leaf_count - 1;
   for (int leaf = low; leaf <= high; leaf++) consider(leaves + 48 * leaf, leaf, &q, best, index);
   Walk walk;
   walk.top = 1, walk.stack[0] = 0;
