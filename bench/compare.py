@@ -4,7 +4,7 @@ from . import record
 from .table import print_table
 
 NOISE = 0.05  # medians of the same code on one quiet machine differed by up to 5 %
-SKIPPED = ("min_s", "spread", "runs", "share")  # parts of a timing that are not compared
+SKIPPED = ("min_s", "spread", "runs", "share", "cores")  # parts of a timing that are not compared
 # Where more is better; everything else measured here (times, errors, faults, bytes) is better when smaller.
 MORE_IS_BETTER = ("times_faster", "overlap", "points_per_s", "rays_per_s")
 

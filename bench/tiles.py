@@ -100,7 +100,11 @@ def faults(scene, surface, device, size=(1024, 1024), lod: float = 4.0, count: i
 
 
 def frames(cases, surfaces, device, count: int, with_peers: bool = True) -> dict:
-    """Return the frame times of every case, and those of the peers on the same cameras."""
+    """Return the frame times of every case, and those of the peers on the same cameras.
+
+    ``cores`` is processor time over wall time: on a busy machine Intel's runtime was seen to draw whole runs with one
+    of two cores, at half the speed; such a run is to be repeated.
+    """
     runners = {case.name: _clsurf_runner(case, surfaces[case.scene, case.degree], device) for case in cases}
     orbits = {case.name: case.cameras(count + WARM) for case in cases}
     plain = [case for case in cases if case.degree == 2 and case.lod == 4.0]
@@ -114,17 +118,20 @@ def frames(cases, surfaces, device, count: int, with_peers: bool = True) -> dict
             if window is not None:
                 runners[case.name, "vtk"] = _peer_runner(window, case.size)
                 closers.append(window)
-    seconds = {key: [] for key in runners}
+    seconds, cores = {key: [] for key in runners}, {key: [] for key in runners}
     for key, run in runners.items():  # programs, buffers and caches are made before the clock starts
         for camera in orbits[key if isinstance(key, str) else key[0]][:3]:
             run(camera)
     for start in range(0, count, BLOCK):
         for key, run in runners.items():
             cameras = orbits[key if isinstance(key, str) else key[0]][start:start + WARM + BLOCK]
+            cpu, wall = time.process_time(), time.perf_counter()
             seconds[key] += [run(camera) for camera in cameras][WARM:]
+            cores[key].append((time.process_time() - cpu) / (time.perf_counter() - wall))
     for window in closers:
         window.close()
-    found = {case.name: {"frame": record.timing(seconds[case.name])} for case in cases}
+    found = {case.name: {"frame": record.timing(seconds[case.name]), "cores": float(np.median(cores[case.name]))}
+             for case in cases}
     for case, peer in itertools.product(plain, ("open3d", "vtk")):
         if (case.name, peer) in seconds:
             other = record.timing(seconds[case.name, peer])
@@ -197,12 +204,12 @@ def show(figures: dict, profile: bool) -> None:
         t, tiles = f["frame"], f["tiles"]
         others = [f"{1e3 * f[p]['median_s']:.1f} ({f[f'times_faster_than_{p}']:.1f}x)" if p in f else "-"
                   for p in ("open3d", "vtk")]
-        rows.append((name, f"{1e3 * t['median_s']:.2f}", f"{1e3 * t['min_s']:.2f}", *others,
+        rows.append((name, f"{1e3 * t['median_s']:.2f}", f"{1e3 * t['min_s']:.2f}", f"{f['cores']:.1f}", *others,
                      f"{tiles['busy']} of {tiles['of']}", f"{1e3 * tiles['ms_per_busy_tile']:.1f}",
                      f"{tiles['largest_evaluations'] / max(tiles['median_evaluations'], 1):.1f}",
                      f"{tiles['ns_per_evaluation']:.3f}"))
     print("frames to host arrays of colour, depth and normal")
-    print_table(("case", "ms", "min ms", "Open3D rays ms", "VTK ms", f"tiles of {TILE} px", "us a tile",
+    print_table(("case", "ms", "min ms", "cores", "Open3D rays ms", "VTK ms", f"tiles of {TILE} px", "us a tile",
                  "largest/median", "ns an evaluation"), rows)
     if profile:
         for name, f in figures["frames"].items():
