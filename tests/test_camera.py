@@ -6,6 +6,7 @@ import pytest
 from clsurf.errors import InputError
 from clsurf.render.camera import Camera
 from clsurf.render.frame import Frame
+from clsurf.surface.cloud import PointCloud
 
 BOX = np.array([[-1.0, -2.0, -0.5], [3.0, 1.0, 0.5]])
 
@@ -43,9 +44,21 @@ def test_framing_sees_every_corner_and_touches_the_border(direction, aspect):
     view = (corners - camera.eye) @ camera.rotation.T
     x, y = p.cx + p.fx * view[:, 0] / -view[:, 2], p.cy - p.fy * view[:, 1] / -view[:, 2]
     border = np.min([x, size[0] - x, y, size[1] - y], axis=0)
-    assert (-view[:, 2] > 0).all() and border.min() >= -1e-6
-    if aspect <= 1:
-        assert border.min() < 1e-6  # not further away than needed
+    assert (-view[:, 2] > 0).all() and -1e-6 <= border.min() < 1e-6  # sees all, not from further away than needed
+
+
+def test_framing_a_scan_is_centred_and_closer_than_its_box():
+    """A cone's top is narrower than its box: framed by its points, the picture is fuller, and margins are equal."""
+    angle, h = np.linspace(0, 60, 4000), np.linspace(0, 1, 4000)
+    cone = PointCloud(np.stack([(1 - h) * np.cos(angle), 2 * h, (1 - h) * np.sin(angle)], axis=1))
+    camera, boxed = Camera.framing(cone, (0.3, 1, 1), margin=1.0), Camera.framing(cone.bounds, (0.3, 1, 1), margin=1.0)
+    assert np.linalg.norm(camera.eye - (0, 1, 0)) < 0.95 * np.linalg.norm(boxed.eye - (0, 1, 0))
+    p = camera.projection((1000, 1000))
+    view = (cone.points + cone.origin - camera.eye) @ camera.rotation.T
+    y = p.cy - p.fy * view[:, 1] / -view[:, 2]
+    x = p.cx + p.fx * view[:, 0] / -view[:, 2]
+    assert min(x.min(), y.min()) >= -1e-3 and max(x.max(), y.max()) <= 1000 + 1e-3
+    assert abs((1000 - y.max()) - y.min()) < 10 and abs((1000 - x.max()) - x.min()) < 10
 
 
 def test_intrinsics_scale_with_the_picture():

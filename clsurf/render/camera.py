@@ -137,7 +137,7 @@ class Camera:
         fov : float
             Vertical, degrees.
         aspect : float
-            Width over height of the picture; where it is above 1 the height decides.
+            Width over height of the picture.
         margin : float
             Free border; 1 touches the edge.
 
@@ -149,16 +149,19 @@ class Camera:
         box = np.asarray(getattr(thing, "bounds", thing), np.float64)
         if box.shape != (2, 3) or not np.isfinite(box).all():
             raise InputError("camera framing: expected something with a finite bounding box, got an empty one")
-        target = box.mean(axis=0)
         rotation = _looking(-np.asarray(direction, np.float64), up)
-        corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-        view = (corners - target) @ rotation.T
-        tan_y = np.tan(np.radians(fov) / 2) / margin
-        tan_x = tan_y * min(aspect, 1.0)
-        # A corner at (X, Y, Z) is inside where |X| <= (distance - Z) tan_x, likewise Y.
-        distance = max((np.abs(view[:, 0]) / tan_x + view[:, 2]).max(), (np.abs(view[:, 1]) / tan_y + view[:, 2]).max())
+        target = box.mean(axis=0)
+        points, reach = _extent(thing, box)
+        view = (points - target) @ rotation.T
+        tan = np.tan(np.radians(fov) / 2) / margin * np.array([aspect, 1.0])
+        shift = np.zeros(2)
+        for _ in range(4):  # the nearest distance depends on the centring, and the other way round
+            distance = _fitting_distance(view, shift, reach, tan)
+            slope = (view[:, :2] - shift) / np.maximum(distance - view[:, 2:], 1e-9 * max(distance, 1e-300))
+            shift = shift + distance * (slope.min(axis=0) + slope.max(axis=0)) / 2
+        distance = _fitting_distance(view, shift, reach, tan)
         distance = distance if distance > 0 else 1.0  # a single point
-        return cls(target + distance * rotation[2], rotation, fov=fov)
+        return cls(target + shift @ rotation[:2] + distance * rotation[2], rotation, fov=fov)
 
     # Use --------------------------------------------------------------------------------------------------------------
 
@@ -211,6 +214,24 @@ class Camera:
                 else f"intrinsics {self.intrinsics_size}")
         eye, forward = np.round(self.eye, 6).tolist(), np.round(-self.rotation[2], 4).tolist()
         return f"Camera({kind}, eye {eye}, looks along {forward})"
+
+
+def _fitting_distance(view, shift, reach, tan) -> float:
+    """Return the eye's distance at which balls at `view` (n, 3) of radius `reach` just fit the half angles `tan`."""
+    # A ball at (X, Y, Z) is inside where |X| + reach <= (distance - Z) tan_x, likewise Y.
+    half = (np.abs(view[:, :2] - shift) + np.reshape(reach, (-1, 1))) / tan
+    return float((half.max(axis=1) + view[:, 2]).max())
+
+
+def _extent(thing, box) -> tuple[NDArray, NDArray | float]:
+    """Return positions (n, 3) float64, world space, and the radii around them that a picture of `thing` must hold."""
+    if hasattr(thing, "centers") and len(thing.centers):
+        leaf = thing.leaf if thing.leaf.any() else np.ones(len(thing.centers), bool)
+        flat = np.sqrt(np.clip(1 - thing.normals[leaf].astype(np.float64) ** 2, 0, 1)).max(axis=1)
+        return thing.centers[leaf] + thing.origin, thing.radii[leaf] * flat * (2 / 3)
+    if hasattr(thing, "points") and len(thing.points):
+        return thing.points + thing.origin, 0.0
+    return np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]), 0.0
 
 
 def _looking(forward, up) -> NDArray:
