@@ -118,7 +118,7 @@ def test_a_full_list_of_leaves_goes_on(form):
     np.testing.assert_allclose(found.reach, reach, rtol=1e-5)
 
 
-@pytest.mark.parametrize("k", [4, 10, 16, 40])
+@pytest.mark.parametrize("k", [10, 40])
 def test_knn_covariance(form, k):
     points = CLOUDS["dense"][:600]
     found = covariance(points, k, device=form)

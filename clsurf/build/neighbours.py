@@ -233,9 +233,9 @@ def nearest(points, k, queries=None, device=None) -> tuple[NDArray, NDArray]:
     asked = _own_queries(tree) if queries is None else _other_queries(tree, queries)
     device.check_memory(neighbours=8 * k * asked.count)
     indices, distances = device.empty((asked.count, k), np.int32), device.empty((asked.count, k), np.float32)
-    device.kernel("build/knn_indices.cl", constants={"VW": device.lanes, "K": k})(
+    device.kernel("build/knn_indices.cl", constants={"VW": device.lanes, "CHUNKS": -(-k // 16)})(
         (-(-asked.count // device.lanes),), _local(device), tree.nodes, tree.leaves, tree.order_on_device, asked.blocks,
-        asked.order, asked.starts, indices, distances, len(tree), asked.count, tree.first_leaf, tree.leaf_count,
+        asked.order, asked.starts, indices, distances, len(tree), asked.count, k, tree.first_leaf, tree.leaf_count,
         tree.unit)
     return device.download(indices), device.download(distances)
 

@@ -1,13 +1,12 @@
-// Indices and distances of the K nearest points of every query, nearest first.
+// Indices and distances of the k nearest points of every query, nearest first.
 //
 // As pass 1 of knn_covariance, with every distance carrying its point along. Points at equal distance come in the order
 // of the tree, so that the result is the same each time.
 #include "build/knn_search.clh"
 
-#ifndef K
-#define K 16
+#ifndef CHUNKS
+#define CHUNKS 1  // k up to 16 CHUNKS; k itself is an argument, because Intel's compiler takes seconds for this kernel
 #endif
-#define CHUNKS ((K + 15) / 16)
 
 #define EXCHANGE_PAIR(da, ia, db, ib) { \
     VI later = (da > db) | ((da == db) & (ia > ib)); \
@@ -15,7 +14,7 @@
     VI i_ = SEL(ia, ib, later); ib = SEL(ib, ia, later); ia = i_; \
   }
 
-// Merge the points of one leaf into the K nearest.
+// Merge the points of one leaf into the k nearest.
 inline void consider(__global const float *leaf, int number, Queries *q, VF best[16 * CHUNKS], VI index[16 * CHUNKS]) {
   VF d[16];
   VI n[16];
@@ -41,9 +40,9 @@ __kernel void knn_indices(__global const VF *nodes, __global const float *leaves
                           __global const float *queries,     // (blocks, 3, 16)
                           __global const uint *query_order,  // (query_count,) where results go
                           __global const uint *starts,       // (blocks,) a leaf near each block of queries
-                          __global int *indices,             // (query_count, K), -1 for none
-                          __global float *distances,         // (query_count, K), INFINITY for none
-                          uint count, uint query_count, int first_leaf, int leaf_count, float unit)
+                          __global int *indices,             // (query_count, k), -1 for none
+                          __global float *distances,         // (query_count, k), INFINITY for none
+                          uint count, uint query_count, int k, int first_leaf, int leaf_count, float unit)
 {
   uint first = get_global_id(0) * VW;
   if (first >= query_count) return;
@@ -58,21 +57,21 @@ __kernel void knn_indices(__global const VF *nodes, __global const float *leaves
   Walk walk;
   walk.top = 1, walk.stack[0] = 0;
   do {
-    int noted = near_leaves(nodes, first_leaf, &q, largest_lane(best[K - 1]), &walk);
+    int noted = near_leaves(nodes, first_leaf, &q, largest_lane(best[k - 1]), &walk);
     for (int i = 0; i < noted; i++) {
       int leaf = walk.list[i];
       if (leaf >= low && leaf <= high) continue;
-      if (any_lane(gap_to_leaf((__global const float *)nodes, first_leaf, leaf, &q) < best[K - 1]))
+      if (any_lane(gap_to_leaf((__global const float *)nodes, first_leaf, leaf, &q) < best[k - 1]))
         consider(leaves + 48 * leaf, leaf, &q, best, index);
     }
   } while (walk.top > 0);
 
-  for (int i = 0; i < K; i++) {
+  for (int i = 0; i < k; i++) {
     union { VF v; float s[VW]; } d;
     union { VI v; int s[VW]; } n;
     d.v = VSQRT(best[i]) * unit, n.v = index[i];
     for (uint j = 0; j < VW && first + j < query_count; j++) {
-      uint at = query_order[first + j] * K + i;
+      uint at = query_order[first + j] * k + i;
       int found = (uint)n.s[j] < count;
       indices[at] = found ? (int)order[n.s[j]] : -1;
       distances[at] = found ? d.s[j] : INFINITY;
