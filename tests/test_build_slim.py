@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from clsurf.build.point_tree import build_point_tree
 from clsurf.build.project import project
+from clsurf.build.radius import Noise
 from clsurf.build.slim import Points, assemble, build_levels, build_slim, check_room, parse_bytes
 from clsurf.errors import Cancelled, DeviceMemoryError, InputError
 from clsurf.surface.cloud import PointCloud
@@ -56,7 +57,7 @@ def fixed_radius_surface(points, normals, degree, spacings, device):
     tree = build_point_tree(points, normals, np.zeros(3, np.float32), 1 / diagonal, device)
     near = cKDTree(points).query(points[::97], 13)[0][:, 12]
     radius = spacings * float(np.median(near)) / np.sqrt(12.5 / np.pi)
-    levels = build_levels(tree, degree, 1e-9, 0.01, silent, fixed_radius=radius / diagonal)
+    levels = build_levels(tree, degree, 1e-9, Noise(0.0, 0.01), silent, fixed_radius=radius / diagonal)
     return assemble(levels, Points(points, normals, None, None), tree, degree, 0.01, diagonal, np.zeros(3))
 
 
@@ -215,7 +216,22 @@ def test_projects_far_points(device):
     near = project(surface, [[0, 0, 50.0], [30.0, 0, 0], [0, -1e4, 0]], device=device)
     np.testing.assert_allclose(near.position, [[0, 0, 0.8], [1, 0, 0], [0, -0.7, 0]], atol=0.06)
     np.testing.assert_allclose(near.distance, [49.2, 29, 1e4 - 0.7], rtol=1e-3)
+    mixed = project(surface, np.concatenate([np.full((7, 3), 4e6), [[0, 0, 0.9]]]), device=device)  # one packet
+    np.testing.assert_allclose(mixed.distance[:7], 4e6 * np.sqrt(3), rtol=1e-5)
+    assert np.isfinite(mixed.position).all()
     assert project(surface, np.zeros((0, 3)), device=device).position.shape == (0, 3)
+
+
+def test_strays_do_not_bridge(device):
+    points, normals = ellipsoid(8000)
+    strays = np.array([[1.3, 0, 0], [0, 1.1, 0], [0, 1.1, 0.01], [0, 1.11, 0], [-1.4, 0.2, 0.1], [-1.5, 0.1, 0]])
+    scan = PointCloud(np.concatenate([points, strays]), normals=np.concatenate([normals, np.tile([0.0, 0, 1], (6, 1))]))
+    surface = build_slim(scan, device=device)
+    outside = np.linalg.norm((surface.centers + surface.origin) / (1, 0.7, 0.8), axis=1) > 1.2
+    assert outside[surface.leaf].any()
+    assert surface.radii[surface.leaf & outside].max() < 0.2  # the gap is 0.3 to 0.5
+    near = project(surface, points, device=device)
+    assert np.abs(near.distance).max() < 0.01
 
 
 @pytest.mark.parametrize("bad", ([[0, 0]], [[np.nan, 0, 0]], [1.0, 2, 3]))

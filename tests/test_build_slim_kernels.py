@@ -123,13 +123,16 @@ def test_choose_centers(tree, sorted_points, spacing):
     assert (chosen == twin.choose_centers(points, closed[:tree.count] == 0, ranges, spacing)).all()
 
 
+LAMBDA = 1e-8
+
+
 def fitted(tree, degree, centers, r_r, penalty=1e-9, mode=slim.SEGMENT):
     device = tree.device
     need = 2 * twin.terms(degree) + 2
     out = device.empty((len(centers), slim.RECORD), np.float32)
     kernel = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree})
-    kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, penalty, 0.02, need, mode,
-           *tree.arguments, out)
+    kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, LAMBDA, penalty, 0.02, need,
+           mode, *tree.arguments, out)
     return device.download(out), need
 
 
@@ -143,7 +146,7 @@ def test_fit_surfels(tree, sorted_points, degree):
         for c, got in zip(centers, record.astype(float), strict=True):
             if (((points - points[c]) ** 2).sum(axis=1) < r_r**2).sum() < need:
                 continue  # the kernel's ball grows, see test_sparse_ball
-            radius_, normal, e, leaf, k = twin.fit_surfels(points, normals, c, r_r, 1e-9, need, degree)
+            radius_, normal, e, leaf, k = twin.fit_surfels(points, normals, c, r_r, LAMBDA, 1e-9, need, degree)
             if bool(got[5]) != leaf or abs(got[0] - radius_) > 1e-4 * radius_:
                 continue  # a decision that rounding tips: another lane, whose E is the same
             agree += 1

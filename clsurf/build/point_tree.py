@@ -72,7 +72,8 @@ class PointTree:
             Cells of colour k are colors[k] to colors[k + 1]; the colour is the parity of a cell's three coordinates.
         """
         step = min(max(0, math.ceil(math.log2(max(width * self.scale, 1.0)))), self.bits)
-        cell = (self.codes if points is None else self.codes[points]) >> np.uint64(3 * step)
+        cell = self.codes.copy() if points is None else self.codes[points]
+        cell >>= np.uint64(3 * step)
         start = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]]))
         last = np.append(start[1:], len(cell)) - 1
         color = (cell[start] & np.uint64(7)).astype(np.uint8)
@@ -136,7 +137,8 @@ def morton_order(points: NDArray, device: Device) -> tuple[NDArray, NDArray, tup
     kernel = device.kernel("build/morton_codes.cl", constants={"BITS": bits, "INDEX_BITS": index_bits})
     kernel((count,), (64,), count, device.upload(points), *map(float, low), cells_per_length, codes)
     # The index below each code makes all keys different, so that a plain sort of the keys gives the order.
-    codes = np.sort(device.download(codes, copy=False))
+    codes = device.download(codes, copy=False)
+    codes.sort()
     order = (codes & np.uint64((1 << index_bits) - 1)).astype(np.int32)
     codes >>= np.uint64(index_bits)
     return order, codes, (bits, cells_per_length)

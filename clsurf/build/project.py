@@ -13,7 +13,6 @@ from ..surface.slim import SlimSurface, frame_of_normals
 from .point_tree import BLOCK, build_boxes, column_bounds, morton_order
 
 LEAF = 24  # floats a leaf (project_points.cl)
-FAR = 1e6  # centre of the balls that pad the last block
 BATCH = 1 << 22  # queries of one launch
 
 
@@ -129,8 +128,8 @@ def leaf_tree(surface: SlimSurface, device: Device, middle: NDArray | None = Non
     records[:, 7:10], records[:, 10:13] = frame_of_normals(normals)
     degree_of_term = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3])[:surface.coefficients.shape[1]]
     records[:, 13:13 + len(degree_of_term)] = surface.coefficients[leaf] * unit ** (degree_of_term - 1.0)
-    balls = np.zeros((4, padded), np.float32)
-    balls[:3] = FAR
+    balls = np.repeat(records[-1:, :4].T, padded, axis=1)
+    balls[3] = -1  # what pads the last block neither widens its box nor is ever near
     balls[:, :count] = records[:, :4].T
     on_device = device.upload(balls)
     boxes, node_offset, top_level = build_boxes(on_device, padded, device, radius=device.upload(balls[3]))

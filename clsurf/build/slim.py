@@ -20,7 +20,7 @@ from ..surface.mesh import Mesh
 from ..surface.slim import COEFFICIENTS, SlimSurface
 from .point_tree import BLOCK, FAR_POINT, PointTree, build_point_tree
 from .project import leaf_tree, project_sorted
-from .radius import LEAST_PENALTY, automatic_error, measure_noise, robust_box, segment_end
+from .radius import LEAST_PENALTY, Noise, automatic_error, measure_noise, robust_box, segment_end
 
 GAMMA = 0.1  # overlap that every point must have (paper: 0.1)
 OVERLAP_ONE = 1 << 20  # fixed point of the overlap sums (cover_points.cl)
@@ -89,7 +89,7 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
     noise = measure_noise(tree)
     error = automatic_error(noise) if error == "auto" else float(error)
     report("points", 1.0)
-    levels = build_levels(tree, degree, max(noise.variance * error**2, LEAST_PENALTY), noise.spacing, report)
+    levels = build_levels(tree, degree, max(noise.variance * error**2, LEAST_PENALTY), noise, report)
     surface = assemble(levels, points, tree, degree, error, diagonal, scan.origin)
     report("bound", 0.0)
     surface = with_bound(surface, tree, middle)
@@ -219,7 +219,7 @@ class Level:
     record: NDArray  # (m, RECORD) float32: radius, normal, e, leaf, coefficients
 
 
-def build_levels(tree: PointTree, degree: int, penalty: float, point_spacing: float, report,
+def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, report,
                  fixed_radius: float | None = None) -> list[Level]:
     """Cover the points level by level until every point is covered by leaves.
 
@@ -227,8 +227,6 @@ def build_levels(tree: PointTree, degree: int, penalty: float, point_spacing: fl
     ----------
     penalty : float
         lambda T^2, over diagonal^4.
-    point_spacing : float
-        Over the diagonal.
     report : callable
         report(stage, done).
     fixed_radius : float, optional
@@ -265,8 +263,8 @@ def build_levels(tree: PointTree, degree: int, penalty: float, point_spacing: fl
             chosen = np.flatnonzero(device.download(state, copy=False) == CENTER).astype(np.int32)
             center = device.upload(chosen)
             record = device.empty((len(chosen), RECORD), np.float32)
-            fit((len(chosen),), (1,), len(chosen), center, r_r, penalty, point_spacing, need, mode, *tree.arguments,
-                record)
+            fit((len(chosen),), (1,), len(chosen), center, r_r, noise.variance, penalty, noise.spacing, need, mode,
+                *tree.arguments, record)
             cover((len(chosen),), (1,), len(chosen), center, record, *tree.arguments, overlap, held)
             centers.append(chosen)
             records.append(record)
@@ -357,8 +355,10 @@ def with_bound(surface: SlimSurface, tree: PointTree, middle: NDArray) -> SlimSu
     chosen = np.arange(wanted) * blocks // wanted
     host = device.download(tree.sorted, copy=False)[:3].reshape(3, blocks, BLOCK)
     queries = np.ascontiguousarray(host[:, chosen]).reshape(3, -1)
+    real = queries[0] < FAR_POINT / 2
+    queries[:, ~real] = queries[:, :1]
     leaves = leaf_tree(surface, device, middle.astype(np.float64))
     result = project_sorted(leaves, device.upload(queries), queries.shape[1], queries.shape[1])
-    distance = np.abs(device.download(result, copy=False)[6, queries[0] < FAR_POINT / 2])
+    distance = np.abs(device.download(result, copy=False)[6, real])
     return replace(surface, bound=float(np.quantile(distance, BOUND_SHARE)) * surface.diagonal,
                    bound_share=BOUND_SHARE)

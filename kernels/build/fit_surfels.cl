@@ -12,10 +12,12 @@
 #define SEGMENT 0 // minimise E over the segment
 #define FORCED 1  // the same, but always a leaf
 #define FIXED 2   // always a leaf, with radius r_r
+#define INNER 3   // never a leaf
 #define CUBIC_LIMIT 1.0f // |c r^2| of a cubic term; beyond it the cubic terms of a lane are dropped
 #define NORMAL_SHARE 0.618034f // of r_r: the ball whose mean normal sets the frame
 #define COMPANY 5  // points of a ball; fewer is alone
 #define SPARSE 6.0f    // point spacings: a quarter of a disc of that radius has more points than a quadratic needs
+#define POOR 0.05f     // e over the radius: a grown ball that fits worse is left to the next levels
 #define LONE_DISC 3.0f // point spacings
 #define RECORD 16 // floats out: radius, normal, e, leaf, coefficients from 6
 
@@ -122,10 +124,11 @@ inline void tame_cubic(const VF *moment, const VF *right, VF r, VF *c) {
 #endif
 
 // The polynomials of the lanes' radii r (over the ball's radius), never wild and never NaN.
-inline void fit_polynomials(const VF *moment, const VF *right, VF r, VF *c) {
-  solve_terms(moment, right, c, TERMS);
+inline void fit_polynomials(const VF *moment, const VF *right, VF r, int terms, VF *c) {
+  for (int k = terms; k < TERMS; ++k) c[k] = 0.0f;
+  solve_terms(moment, right, c, terms);
 #if DEGREE == 3
-  tame_cubic(moment, right, r, c);
+  if (terms == TERMS) tame_cubic(moment, right, r, c);
 #endif
   for (int k = 0; k < TERMS; ++k) c[k] = SEL((VF)0.0f, c[k], (c[k] > -1e6f) & (c[k] < 1e6f));
 }
@@ -158,7 +161,7 @@ inline float fit_all_points(int padded, __global const float *sorted, __global c
   VF SUMS;
   EACH_CHUNK(union { float16 v; } m[MOMENTS + TERMS]; MONOMIALS ADD_LANES)
   STORE_LANES
-  fit_polynomials(moment, right, (VF)1.0f, coefficient);
+  fit_polynomials(moment, right, (VF)1.0f, TERMS, coefficient);
   EACH_CHUNK(float16 f = c.w.v - height_at(coefficient, c.u.v, c.v.v); sum += g * f * f; total += g;)
   return sum_lanes(sum) / (sum_lanes(total) + 1e-30f);
 }
@@ -177,8 +180,8 @@ inline float turn_to_plane(const Frame *f, VF *normal, VF *c) {
 #endif
 
 // The lane to take: a leaf's, or 14 for an internal surfel.
-inline int choose_lane(const float *energy, const float *e2, const int *count, int need, int mode, int stride,
-                       int *leaf) {
+inline int choose_lane(const float *energy, const float *e2, const int *count, float lambda, int need, int mode,
+                       int stride, int *leaf) {
   int lowest = 14;
   while (lowest > 0 && count[lowest - 1] >= need) --lowest;
   int best = 14;
@@ -188,11 +191,12 @@ inline int choose_lane(const float *energy, const float *e2, const int *count, i
   // A leaf: an interior minimum with e rising (condition 4), E still falling at r_r, or no smaller radius to try.
   int middle = lowest > 7 ? lowest : 7;
   int rising = e2[lowest] <= e2[middle] && e2[middle] <= e2[14];
-  // A true minimum has e^2 = lambda (T/r)^2 / (degree + 1); far above it e is a plateau: detail smoothed away between two
-  // scales (the demo's flutes and rosettes: 12 leaves of 16K, e^2 up to 2000 times the penalty). Finer levels resolve it.
-  int plateau = lowest == 0 && e2[best] > 4.0f * (energy[best] - e2[best]);
-  *leaf = mode != SEGMENT || (!plateau && (best == 14 || (best > lowest && rising) ||
-                                           (best == lowest && lowest > 0 && stride == 1)));
+  // A true minimum has e^2 = lambda (T/r)^2 / (degree + 1), above the noise; far above it e is a plateau: detail smoothed
+  // away between two scales (the demo's flutes and rosettes: 12 leaves of 16K, e^2 up to 2000 times the penalty). Finer
+  // levels resolve it. lambda is about 0.7 of the noise's variance.
+  int plateau = lowest == 0 && e2[best] > 4.0f * (energy[best] - e2[best]) + 3.0f * lambda;
+  *leaf = !plateau && (best == 14 || (best > lowest && rising) || (best == lowest && lowest > 0 && stride == 1));
+  if (mode != SEGMENT) *leaf = mode != INNER;
   return *leaf ? best : 14;
 }
 
@@ -206,9 +210,10 @@ inline void write_disc(__global float *o, float radius, float x, float y, float 
   o[5] = 1.0f;
 }
 
-// A ball with too few points grows to twice its size or to SPARSE point spacings, and makes do with what it then has;
-// a point that is nearly alone gets a disc: a grown ball would bridge to the next surface.
-__kernel void fit_surfels(int surfels, __global const int *center, float r_r, float lambda_t2, float spacing, int need, int mode,
+// A ball with too few points grows, to twice its size or to SPARSE point spacings, and makes do with a plane if it then
+// still has too few; a point that is nearly alone gets a disc. Where the points fill less than half of the ball (a small
+// island), the next levels' smaller balls decide: grown, it would bridge to the next surface.
+__kernel void fit_surfels(int surfels, __global const int *center, float r_r, float lambda, float lambda_t2, float spacing, int need, int mode,
                           int padded, __global const float *sorted, __global const float *boxes,
                           __global const int *node_offset, int top_level, __global float *out) {
   int s = get_global_id(0);
@@ -217,20 +222,27 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
   float x = sorted[own], y = sorted[padded + (size_t)own], z = sorted[2 * (size_t)padded + own];
   Ball ball;
   float radius = r_r;
+  int terms = TERMS;
   gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius);
+  int wide = r_r > SPARSE * spacing, compact = wide && ball.extent2 < 0.25f * r_r * r_r;
+  if (compact && mode == SEGMENT) mode = INNER;
   if (ball.count < need) {
-    if (ball.count < COMPANY && r_r > SPARSE * spacing) {
-      write_disc(out + RECORD * (size_t)s, r_r < LONE_DISC * spacing ? r_r : LONE_DISC * spacing,
-                 sorted[3 * (size_t)padded + own], sorted[4 * (size_t)padded + own], sorted[5 * (size_t)padded + own]);
-      return;
-    }
-    float limit = 2.0f * r_r > SPARSE * spacing ? 2.0f * r_r : SPARSE * spacing;
-    mode = mode == SEGMENT ? FORCED : mode;
-    while (ball.count < need && radius < limit) {
+    float limit = compact ? r_r : wide ? 2.0f * r_r : SPARSE * spacing;
+    if (mode == SEGMENT) mode = FORCED;
+    int alone = wide && ball.count < (compact ? 2 : COMPANY);
+    while (!alone && ball.count < need && 1.25f * radius <= limit) {
       radius *= 1.25f;
       gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius);
     }
-    need = need < ball.count ? need : ball.count;
+    if (alone || (wide && !compact && ball.count < need)) {
+      write_disc(out + RECORD * (size_t)s, LONE_DISC * spacing, sorted[3 * (size_t)padded + own],
+                 sorted[4 * (size_t)padded + own], sorted[5 * (size_t)padded + own]);
+      return;
+    }
+    if (ball.count < need) {
+      need = 1, terms = 3;
+      if (mode == FORCED) mode = FIXED; // no choice among radii that hold two or three points
+    }
   }
   // Lanes' radii over the ball's: g^(2 (14 - i) / 14).
   VF r = (VF)(0.381966011f, 0.409151886f, 0.438272665f, 0.469466063f, 0.502879599f, 0.538671289f, 0.577010394f,
@@ -241,12 +253,20 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
   Frame frame = frame_of_ball(&ball, sorted[3 * (size_t)padded + own], sorted[4 * (size_t)padded + own],
                               sorted[5 * (size_t)padded + own]);
   sum_moments(&ball, &frame, 1.0f / radius, inverse_r2, moment, right, &count.v);
-  fit_polynomials(moment, right, r, c);
+  fit_polynomials(moment, right, r, terms, c);
   union { VF v; float s[16]; } e2, energy;
   e2.v = mean_residual2(&ball, &frame, 1.0f / radius, inverse_r2, c) * (radius * radius);
   energy.v = e2.v + inverse_r2 * (lambda_t2 / (radius * radius));
-  int leaf, lane = choose_lane(energy.s, e2.s, count.s, need, mode, ball.stride, &leaf);
+  int leaf, lane = choose_lane(energy.s, e2.s, count.s, lambda, need, mode, ball.stride, &leaf);
+#ifndef WEIGHTED
+  // Evenly spread points weigh a quarter of their number; a stray whose neighbours all lie near the rim fits itself.
+  if (leaf && wide && mode == SEGMENT && ((float *)&moment[0])[lane] < 0.125f * need) leaf = 0, lane = 14;
+#endif
   float error2 = e2.s[lane], share = ((float *)&r)[lane];
+  if (wide && radius > r_r && mode == FORCED && error2 > POOR * POOR * radius * radius) { // strays, no sparse surface
+    leaf = 0;
+    share = r_r / radius;
+  }
   for (int k = 0; k < TERMS; ++k) c[k] = ((float *)&c[k])[lane];
   if (ball.stride > 1) { // a thinned ball chose the radius; the surfel is fitted to all points
     for (int k = 0; k < TERMS; ++k) c[k] = 0.0f;
@@ -265,6 +285,7 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
   o[4] = sqrt(error2);
   o[5] = leaf;
   float scale[4] = {radius, 1.0f, 1.0f / radius, 1.0f / (radius * radius)}; // out of the units of the radius
+  for (int k = 0; k < 10; ++k) o[6 + k] = 0.0f;
   for (int k = 0; k < (DEGREE == 1 ? 1 : TERMS); ++k)
     o[6 + k] = ((float *)&c[k])[0] * scale[TERM_U[k] + TERM_V[k]];
 }

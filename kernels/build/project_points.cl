@@ -41,12 +41,12 @@ inline Sphere sphere_around(Vectors p) {
   return s;
 }
 
-// Leaves of a block whose balls come within `reach` of a sphere's centre.
+// Leaves of a block whose balls come within `reach` of a sphere's centre; what pads the last block has no radius.
 inline int16 near_leaves(__global const float *balls, size_t padded, size_t block, Sphere s, float reach) {
   VF dx = ((__global const VF *)balls)[block] - s.x, dy = ((__global const VF *)(balls + padded))[block] - s.y,
      dz = ((__global const VF *)(balls + 2 * padded))[block] - s.z;
-  VF r = ((__global const VF *)(balls + 3 * padded))[block] + reach;
-  return dx * dx + dy * dy + dz * dz <= r * r;
+  VF r = ((__global const VF *)(balls + 3 * padded))[block];
+  return (dx * dx + dy * dy + dz * dz <= (r + reach) * (r + reach)) & (r > 0.0f);
 }
 
 inline VF height_of(__global const float *k, VF u, VF v) {

@@ -138,7 +138,7 @@ def fit_at(points, normals, center, radius, frame_radius, degree):
     return frame, c, (g * f**2).sum() / g.sum()
 
 
-def fit_surfels(points, normals, center, r_r, penalty, need, degree):
+def fit_surfels(points, normals, center, r_r, noise, penalty, need, degree):
     """Radius, normal, e, leaf and coefficients of the surfel at `center` in the segment that ends at r_r."""
     radii = r_r * GOLDEN ** (2 * (14 - np.arange(15)) / 14)
     d2 = ((points - points[center]) ** 2).sum(axis=1)
@@ -150,7 +150,8 @@ def fit_surfels(points, normals, center, r_r, penalty, need, degree):
     best = max(range(lowest, 15), key=lambda i: (-energy[i], i))
     middle = max(lowest, 7)
     rising = e2[lowest] <= e2[middle] <= e2[14]
-    leaf = best == 14 or (best > lowest and rising) or (best == lowest and lowest > 0)
+    plateau = lowest == 0 and e2[best] > 4 * penalty / radii[best] ** 2 + 3 * noise
+    leaf = not plateau and (best == 14 or (best > lowest and rising) or (best == lowest and lowest > 0))
     best = best if leaf else 14
     frame, c, mean2 = fits[best]
     normal = frame[2]
