@@ -1,6 +1,8 @@
 """The device layer: choosing, sources, kernels, memory, drivers."""
 
+import ctypes
 import gc
+import os
 import subprocess
 import sys
 import threading
@@ -215,12 +217,24 @@ def test_processor_names():
     assert pocl_target.target_name(set()) == "x86-64"
 
 
+def test_pocl_target_takes_the_first_of_several_pointers():
+    # The record's neighbours on the heap point to the same text in about one process of thirty.
+    text = ctypes.create_string_buffer(b"generic")
+    record = (ctypes.c_uint64 * 512)()
+    fd = os.open("/proc/self/mem", os.O_RDONLY)
+    try:
+        assert pocl_target.first_pointer_to_generic(fd, ctypes.addressof(record)) is None
+        record[80] = record[90] = ctypes.addressof(text)
+        assert pocl_target.first_pointer_to_generic(fd, ctypes.addressof(record)) == 640
+    finally:
+        os.close(fd)
+
+
 def test_vendors_folder_is_made_and_a_users_own_respected(tmp_path):
     """In a fresh process each: the module acts once."""
     code = "import os; from clsurf.device import icd; icd.prepare(); print(os.environ.get('OCL_ICD_VENDORS', ''))"
     run = lambda env: subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,  # noqa: E731
                                      env=env).stdout.strip()
-    import os
     env = {k: v for k, v in os.environ.items() if k != "OCL_ICD_VENDORS"} | {"XDG_CACHE_HOME": str(tmp_path)}
     made = run(env)
     if icd.wanted_entries():

@@ -2,7 +2,7 @@
 
 pip's PoCL 3.0 carries LLVM 14, which names processors newer than itself (AMD Zen 5 on) "generic"; its clang then
 refuses every kernel with "unknown target CPU 'generic'". PoCL has no setting for the name. The device's record holds
-it as a C string, so the record is searched for that one pointer, which is replaced by the name of an older processor
+it as a C string, so the record is searched for the pointer to it, which is replaced by the name of an older processor
 with the same instruction sets. Measured on a Zen 5: 454 GFLOP/s as skylake-avx512, 78 as znver3; without it, nothing
 compiles.
 """
@@ -15,7 +15,9 @@ import struct
 
 log = logging.getLogger("clsurf")
 
-RECORD_BYTES = 4096  # PoCL 3.0's device record is shorter; reading stops at the first unreadable page
+# Searched for the name, which stands at byte 640 of PoCL 3.0's record. Its neighbours on the heap point to the same
+# string, the nearest seen 3.6 KB further and sometimes nearer: the first pointer is the record's own.
+RECORD_BYTES = 2048
 _names: list = []  # the strings must outlive the process's use of them
 
 
@@ -49,17 +51,22 @@ def name_processor(device) -> str | None:
     name = target_name(cpu_flags())
     fd = os.open("/proc/self/mem", os.O_RDONLY)  # pread reports an unreadable address instead of crashing
     try:
-        offsets = [offset for offset in range(0, RECORD_BYTES, 8) if _points_to_generic(fd, device.int_ptr + offset)]
+        offset = first_pointer_to_generic(fd, device.int_ptr)
     finally:
         os.close(fd)
-    if len(offsets) != 1:
+    if offset is None:
         log.warning("PoCL: the processor's name was not found in the device's record; kernels may not compile")
         return None
     buffer = ctypes.create_string_buffer(name.encode())
     _names.append(buffer)
-    ctypes.c_uint64.from_address(device.int_ptr + offsets[0]).value = ctypes.addressof(buffer)
+    ctypes.c_uint64.from_address(device.int_ptr + offset).value = ctypes.addressof(buffer)
     log.debug("PoCL: compiling for %s", name)
     return name
+
+
+def first_pointer_to_generic(fd: int, address: int) -> int | None:
+    """Return how far behind `address` the first pointer to the text "generic" stands; None where there is none."""
+    return next((offset for offset in range(0, RECORD_BYTES, 8) if _points_to_generic(fd, address + offset)), None)
 
 
 def _points_to_generic(fd: int, address: int) -> bool:
