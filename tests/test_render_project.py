@@ -10,7 +10,7 @@ from reference.surfaces import fitted, leaves, sphere, torus_points, two_level_s
 from clsurf.errors import InputError
 from clsurf.render.camera import Camera
 from clsurf.render.slim import height_bounds, place_slim, project_slim, select_slim, upload_slim
-from clsurf.render.tiles import DEPTH_BUCKETS, Grid, Layout, Scratch, bin_pairs, order_depths, scan
+from clsurf.render.tiles import Scratch
 
 LANES = (16, 8, 4, 1)
 
@@ -167,58 +167,6 @@ def test_broken_surfels_are_not_drawn(device):
     full = device.download(staged(device, bad, Camera.look_at((0, 0, 4), (0, 0, 0)), (100, 100))[5].full)
     shown = full[:, 0] <= full[:, 2]
     assert not shown[:80].any() and shown[80:].sum() == 120
-
-
-# Lists ----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("size", [(1, 1), (61, 43), (256, 128)])
-def test_bin_lists(device, torus, size):
-    """order_depths, count_bins, scan_bins, scan_totals and fill_bins together equal brute force."""
-    camera = cameras()[0]
-    scratch, upload, _, _, _, footprints = staged(device, torus, camera, size)
-    bins = (-(-size[0] // 8), -(-size[1] // 8))
-    grid = Grid(size, 4, Layout(), None, None)
-    pairs = bin_pairs(device, scratch, grid, footprints, upload.count)
-    full, core, keys, buckets = (device.download(a) for a in (footprints.full, footprints.core, footprints.keys,
-                                                              footprints.buckets))
-    order = twin.order_depths(full, buckets)
-    lists = twin.bin_lists(order, full, *bins)
-    offsets = device.download(pairs.offsets)
-    assert (np.diff(offsets) == [len(entries) for entries in lists]).all()
-    got = device.download(pairs.pairs)
-    assert (got[:, 0] & 0x3FFFFFFF == np.concatenate([np.array(entries, int) for entries in lists])).all()
-    for b, entries in enumerate(lists):
-        x, y = b % bins[0], b // bins[0]
-        for (first, second), i in zip(got[offsets[b]:offsets[b + 1]], entries, strict=True):
-            bits = twin.block_bits(core[i], x, y) << 4 | twin.block_bits(full[i], x, y)
-            assert second == (keys[i] & 0xFFFFFF00) | bits and first >> 30 == keys[i] & 3
-
-
-def test_order_depths(device):
-    rng = np.random.default_rng(0)
-    n = 20000
-    full = np.tile(np.array([0, 0, 0, 0], np.int16), (n, 1))
-    full[rng.uniform(size=n) < 0.3, 0] = 1
-    buckets = rng.integers(0, DEPTH_BUCKETS, n).astype(np.uint16)
-    scratch = Scratch(device, 16)
-    touch = type("Touch", (), {"full": device.upload(full), "buckets": device.upload(buckets)})
-    order, offsets = order_depths(device, scratch, touch, n)
-    offsets = device.download(offsets)
-    assert (np.diff(offsets) == twin.count_depths(full, buckets)).all()
-    assert (device.download(order)[:offsets[-1]] == twin.order_depths(full, buckets)).all()
-
-
-@pytest.mark.parametrize("bins", [1, 63, 64, 65, 1000])
-def test_scan(device, bins):
-    counts = np.random.default_rng(1).integers(0, 9, (5, bins)).astype(np.uint32)
-    on_device, totals, offsets = device.empty((5, bins), np.uint32), device.empty(bins, np.uint32), device.empty(
-        bins + 1, np.uint32)
-    device.write(on_device, counts)
-    scan(device, on_device, 5, bins, totals, offsets)
-    assert (device.download(on_device) == np.cumsum(counts, axis=0) - counts).all()
-    assert (device.download(totals) == counts.sum(axis=0)).all()
-    assert (device.download(offsets) == np.concatenate([[0], np.cumsum(counts.sum(axis=0))])).all()
 
 
 def test_too_many_surfels(device, monkeypatch):

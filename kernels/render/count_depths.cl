@@ -1,4 +1,4 @@
-// Count the drawn primitives of every depth bucket, each chunk of primitives apart (see count_bins). Twin: order_depths.
+// Count the drawn primitives of every depth bucket, each chunk of primitives apart (see count_bins). Twin: count_depths.
 __kernel void count_depths(__global const short4 *full, __global const ushort *buckets, int count, int chunk,
                            int bucket_count, __global uint *counts) {
   int part = get_global_id(0);

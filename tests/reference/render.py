@@ -230,26 +230,65 @@ def bucket_of(view, near):
     return np.clip((near - v.first_depth) / v.bucket, 0, BUCKETS - 1).astype(int)
 
 
+def chunks(count, parts, length):
+    """The ranges that each of `parts` work-items handles."""
+    return [range(min(part * length, count), min((part + 1) * length, count)) for part in range(parts)]
+
+
+def shown(full):
+    """Which primitives touch the picture."""
+    return full[:, 0] <= full[:, 2]
+
+
+def count_depths(full, buckets, parts, length):
+    """Number (parts, BUCKETS) of drawn primitives of every bucket in every chunk."""
+    out = np.zeros((parts, BUCKETS), int)
+    for part, chunk in enumerate(chunks(len(full), parts, length)):
+        for i in chunk:
+            out[part, buckets[i]] += shown(full)[i]
+    return out
+
+
+def scan_bins(counts):
+    """Offsets (parts, bins) of every chunk within its bin, and the bins' totals."""
+    return np.cumsum(counts, axis=0) - counts, counts.sum(axis=0)
+
+
+def scan_totals(totals):
+    """Offsets (bins + 1,) of the bins."""
+    return np.concatenate([[0], np.cumsum(totals)])
+
+
 def order_depths(full, buckets):
     """The drawn primitives by depth bucket, then by number."""
-    shown = np.flatnonzero(full[:, 0] <= full[:, 2])
-    return shown[np.argsort(buckets[shown], kind="stable")]
+    drawn = np.flatnonzero(shown(full))
+    return drawn[np.argsort(buckets[drawn], kind="stable")]
 
 
-def count_depths(full, buckets):
-    """Number of drawn primitives of every bucket."""
-    return np.bincount(buckets[full[:, 0] <= full[:, 2]], minlength=BUCKETS)
+def bins_of(blocks, bins_x):
+    """The bins that a range of blocks (4,) touches, row by row."""
+    x0, y0, x1, y1 = (int(b) // 2 for b in blocks)
+    return [y * bins_x + x for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)]
 
 
-def bin_lists(order, full, bins_x, bins_y):
-    """The primitives of every bin, in the given order: what count_bins, scan_bins, scan_totals and fill_bins make."""
-    lists = [[] for _ in range(bins_x * bins_y)]
+def count_bins(order, full, parts, bins_x, bin_count):
+    """Number (parts, bins) of primitives that may touch every bin, for every chunk of `order`."""
+    out = np.zeros((parts, bin_count), int)
+    for part, chunk in enumerate(chunks(len(order), parts, -(-len(order) // parts))):
+        for i in chunk:
+            out[part, bins_of(full[order[i]], bins_x)] += 1
+    return out
+
+
+def fill_bins(order, full, core, keys, bins_x, bin_count):
+    """The pairs (n, 2) of all bins, bin after bin, each in the given order (kernels/common/bins.clh)."""
+    lists = [[] for _ in range(bin_count)]
     for i in order:
-        x0, y0, x1, y1 = (int(b) // 2 for b in full[i])
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                lists[y * bins_x + x].append(int(i))
-    return lists
+        for b in bins_of(full[i], bins_x):
+            x, y = b % bins_x, b // bins_x
+            bits = block_bits(core[i], x, y) << 4 | block_bits(full[i], x, y)
+            lists[b].append((int(i) | (int(keys[i]) & 3) << 30, int(keys[i]) & 0xFFFFFF00 | bits))
+    return np.array([pair for pairs in lists for pair in pairs], np.uint32).reshape(-1, 2)
 
 
 def block_bits(blocks, x, y):
