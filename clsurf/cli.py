@@ -310,8 +310,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     except typer.Exit as leave:
         return leave.exit_code
-    except BrokenPipeError:
-        # The reader of our output has gone; nothing more can be said to it.
+    except (BrokenPipeError, SystemExit):
+        # The reader of our output has gone (the option parser turns that into an exit); nothing more can be said to it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except MemoryError:
