@@ -254,3 +254,12 @@ def test_doctor_finds_this_machine_healthy():
     findings = examine()
     assert all(f.good for f in findings), [f for f in findings if not f.good]
     assert sum("compiles and computes" in f.detail for f in findings) == len(all_devices())
+
+
+def test_a_device_is_named_once(device, caplog):
+    """A second device object on the same record, through a context of the user's own, leaves the record alone."""
+    mine = cl.Context([device.cl_device])
+    check(open_device(mine))
+    first = pocl_target.name_processor(device.cl_device)
+    assert pocl_target.name_processor(device.cl_device) == first
+    assert "not found" not in caplog.text

@@ -18,7 +18,8 @@ log = logging.getLogger("clsurf")
 # Searched for the name, which stands at byte 640 of PoCL 3.0's record. Its neighbours on the heap point to the same
 # string, the nearest seen 3.6 KB further and sometimes nearer: the first pointer is the record's own.
 RECORD_BYTES = 2048
-_names: list = []  # the strings must outlive the process's use of them
+# By device record: named once, since a second search would find a neighbour's pointer. The strings live for ever.
+_named: dict[int, ctypes.Array] = {}
 
 
 def target_name(flags: set[str]) -> str:
@@ -48,6 +49,8 @@ def name_processor(device) -> str | None:
         return None
     if "PoCL 3.0" not in device.platform.version or not device.version.rstrip().endswith("-generic"):
         return None
+    if device.int_ptr in _named:
+        return _named[device.int_ptr].value.decode()
     name = target_name(cpu_flags())
     fd = os.open("/proc/self/mem", os.O_RDONLY)  # pread reports an unreadable address instead of crashing
     try:
@@ -58,7 +61,7 @@ def name_processor(device) -> str | None:
         log.warning("PoCL: the processor's name was not found in the device's record; kernels may not compile")
         return None
     buffer = ctypes.create_string_buffer(name.encode())
-    _names.append(buffer)
+    _named[device.int_ptr] = buffer
     ctypes.c_uint64.from_address(device.int_ptr + offset).value = ctypes.addressof(buffer)
     log.debug("PoCL: compiling for %s", name)
     return name
