@@ -100,15 +100,13 @@ def test_project_slim(device, torus, which, lanes):
     assert np.abs(buckets.astype(int) - twin.bucket_of(view, near.astype(np.float64))).max() <= 1
 
 
-@pytest.mark.parametrize("which", range(3))
-def test_blocks_hold_every_hit(device, torus, which):
+def assert_blocks_hold_every_hit(device, surface, camera, size):
     """Brute force: no hit of any surfel, of either side, lies outside its blocks, its sides, or before its key."""
-    camera, size = cameras()[which], (90, 70)
-    _, _, view, _, _, footprints = staged(device, torus, camera, size)
+    _, _, view, _, _, footprints = staged(device, surface, camera, size)
     pixels = twin.pixel_centres(size)
-    exact = twin.project_slim(view, torus)
+    exact = twin.project_slim(view, surface)
     at, d = twin.local(exact, pixels)
-    poly = twin.ray_poly(torus.degree, exact, at, d)
+    poly = twin.ray_poly(surface.degree, exact, at, d)
     arrays = footprints.full, footprints.core, footprints.keys
     full, core, keys = (device.download(a).astype(np.int64) for a in arrays)
     shown = full[:, 0] <= full[:, 2]
@@ -117,7 +115,7 @@ def test_blocks_hold_every_hit(device, torus, which):
     bx, by = pixels[:, 0].astype(int) // 4, pixels[:, 1].astype(int) // 4
     total = 0
     for bit, side in ((1, 1.0), (2, -1.0)):
-        s, _, good = twin.ray_root(torus.degree, poly, side)
+        s, _, good = twin.ray_root(surface.degree, poly, side)
         with np.errstate(invalid="ignore"):
             t, r2 = exact[:, twin.T_REF] + s, ((at + s[..., None] * d) ** 2).sum(axis=-1)
         for blocks, radius in ((full, 1.0), (core, twin.ALPHA)):
@@ -129,6 +127,35 @@ def test_blocks_hold_every_hit(device, torus, which):
             assert (t[p, n] > near[n] - 1e-4).all()
             total += len(p)
     assert total > 1000
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_blocks_hold_every_hit(device, torus, which):
+    assert_blocks_hold_every_hit(device, torus, cameras()[which], (90, 70))
+
+
+def around_the_eye(degree, seed, count=200):
+    """Surfels whose balls reach the plane of an eye at the origin that looks along -z: facing every way, half of them
+    nearly that plane; their surfaces up to 0.9 radii off the ball's centre."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(count, 3)) * np.where(np.arange(count) % 2, 1, 0.15)[:, None]
+    normals[::2, 2] += 1
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radii = rng.uniform(0.5, 1.5, count)
+    centers = radii[:, None] * rng.uniform(-1, 1, (count, 3))
+    order = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3])[:{1: 1, 2: 6, 3: 10}[degree]]
+    k = rng.uniform(-0.2, 0.2, (count, len(order)))
+    k[:, 0] = rng.uniform(-0.9, 0.9, count)
+    return leaves(centers, radii, normals, k * radii[:, None] ** (1 - order), degree)
+
+
+@pytest.mark.parametrize("fov, near", ((30, 0.0), (120, 0.0), (120, 0.3)))
+@pytest.mark.parametrize("degree", (1, 2, 3))
+def test_blocks_at_the_eyes_plane(device, degree, fov, near):
+    """Bounds and sides of surfels that reach the eye's plane; those with their centre behind it need `crosses`."""
+    for seed in range(2):
+        camera = Camera.look_at((0, 0, 0), (0, 0, -1), fov=fov, near=near)
+        assert_blocks_hold_every_hit(device, around_the_eye(degree, seed), camera, (24, 18))
 
 
 def test_blocks_are_tight(device):

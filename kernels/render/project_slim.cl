@@ -2,7 +2,8 @@
 // from front to back. One work-item handles VW surfels. Twin: tests/reference/render.py, project_slim.
 //
 // The blocks bound the piece of surface inside the ball, a disc in (u, v) times LOW <= w <= HIGH, not the ball: seen
-// edge-on that is much less. A piece that reaches the eye's plane may appear anywhere, so it gets the whole picture.
+// edge-on that is much less. A piece that reaches the eye's plane, or whose centre lies behind it, may appear anywhere, so
+// it gets the whole picture.
 #include "common/slim.clh"
 #include "common/select_slim.clh"
 #include "common/bins.clh"
@@ -105,7 +106,8 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   VF front, back, one = 1.0f;
   extent(one, -nZ, 1.0f, low, high, &front, &back);
   VF near = depth + r * front, far = depth + r * back;
-  VI crosses = perspective ? (near < 1e-3f * r) : (VI)(0);
+  // The bounds below need centre and piece in front of the eye's plane.
+  VI crosses = perspective ? (lesser(near, depth) < 1e-3f * r) : (VI)(0);
   VF inv_near = perspective ? 1.0f / greater(near, 1e-3f * r) : one;
   VF inv_far = perspective ? 1.0f / greater(far, 1e-3f * r) : one;
   VF safe_t = perspective ? 1.0f / greater(depth, 1e-3f * r) : (VF)(0.0f);
@@ -131,8 +133,9 @@ __kernel void project_slim(__global const float *view, __global const float *sur
     block_range(lo_x, hi_x, view[WIDTH], &block[4 * pass], &block[4 * pass + 2]);
     block_range(lo_y, hi_y, view[HEIGHT], &block[4 * pass + 1], &block[4 * pass + 3]);
   }
-  // Which sides can be seen: over the unit disc f' along the ray of the centre is its value there plus a linear form
-  // (and for degree 3 a bounded rest); the ray's own direction changes by up to r / depth.
+  // Which sides can be seen: over the unit disc f' along the ray of the reference point is its value there plus a linear
+  // form (and for degree 3 a bounded rest). The ray of another point p of the ball differs, up to a positive factor, by
+  // p less the reference point, over t_ref: at most REACH / t_ref, also at the eye's plane.
   __global const VF *k = plane + COEFFICIENTS * step;
   VF ud = uX * dX + uY * dY - uZ, vd = vX * dX + vY * dY - vZ, at_centre = nd, spread = 0.0f;
 #if DEGREE >= 2
@@ -145,15 +148,15 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   VF cv = k[8 * step] * ud + 3.0f * (k[9 * step] * vd);
   spread += magnitude(cu) + magnitude(cm) + magnitude(cv);
 #endif
-  if (perspective) spread += r * inv_t * (1.0f + slope);
-  VI enters = (at_centre - spread < 0.0f) | crosses, leaves = (at_centre + spread > 0.0f) | crosses;
+  VF off = t_ref - depth;
+  if (perspective) spread += (r + off) * inv_t * (1.0f + slope);
+  VI enters = at_centre - spread < 0.0f, leaves = at_centre + spread > 0.0f;
   VU bits = AS_VU(near);
   VU ordered = bits ^ SEL((VU)(0x80000000u), (VU)(0xffffffffu), AS_VI(bits) < 0);
   ordered = (ordered & 0xffffff00u) | AS_VU(SEL((VI)(0), (VI)(1), enters) | SEL((VI)(0), (VI)(2), leaves));
   VF bucket = (near - view[FIRST_DEPTH]) * (1.0f / view[BUCKET_DEPTH]);
   bucket = lesser(greater(bucket, (VF)(0.0f)), (VF)(DEPTH_BUCKETS - 1));
   VI bucket_number = TO_VI(bucket);
-  VF off = t_ref - depth;
 
   VF px = unit / fx, py = -unit / fy;
   VF field[RECORD_FLOATS];
