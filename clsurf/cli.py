@@ -5,6 +5,7 @@ line per step elsewhere.
 """
 
 import contextlib
+import math
 import os
 import sys
 import time
@@ -14,6 +15,8 @@ from typing import Annotated
 import typer
 
 from .errors import Error, InputError
+
+PICTURES = (".png", ".jpg", ".jpeg", ".exr")
 
 app = typer.Typer(name="clsurf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Compact surface models from scans, drawn on any OpenCL device.",
@@ -66,6 +69,14 @@ class Steps:
             print(text, file=sys.stderr, flush=True)
 
 
+def checked_out(path: Path, endings=()) -> Path:
+    """Return `path` if it can be written and ends in one of `endings`: told before the work, not after it."""
+    if endings and path.suffix.lower() not in endings:
+        raise InputError(f"output {path}: expected a name that ends in {', '.join(endings[:-1])} or {endings[-1]}")
+    from .io.files import writable_place
+    return writable_place(path)
+
+
 def parsed_size(text: str) -> tuple[int, int]:
     """Return (width, height) of a text such as 1024x768."""
     width, _, height = text.lower().partition("x")
@@ -79,18 +90,37 @@ def parsed_error(text: str) -> float | str:
     if text == "auto":
         return text
     try:
-        return float(text)
+        value = float(text)
+        if not 0 < value < 1:
+            raise ValueError
     except ValueError:
-        raise InputError(f"error: expected a number such as 0.01, or auto, got {text!r}") from None
+        raise InputError(f"error: expected a number between 0 and 1 such as 0.01, or auto, got {text!r}") from None
+    return value
 
 
 def parsed_vector(name: str, text: str) -> tuple[float, float, float]:
     """Return three numbers of a text such as 1,0.5,2."""
     try:
         x, y, z = (float(part) for part in text.split(","))
+        if not 0 < x * x + y * y + z * z < float("inf"):
+            raise ValueError
     except ValueError:
-        raise InputError(f"{name}: expected three numbers such as 1,0.5,2, got {text!r}") from None
+        raise InputError(f"{name}: expected three numbers such as 1,0.5,2, not all 0, got {text!r}") from None
     return x, y, z
+
+
+def print_version(wanted: bool):
+    """Print the version and leave, where it is asked for."""
+    if wanted:
+        from . import __version__
+        print(f"clsurf {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(version: Annotated[bool, typer.Option("--version", callback=print_version, is_eager=True,
+                                                  help="Print the version.")] = False):
+    """Compact surface models from scans, drawn on any OpenCL device."""
 
 
 @app.command()
@@ -100,7 +130,8 @@ def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg,
     """Make a scan, build its surface, draw it, and say where the picture is and how long each step took."""
     import clsurf
     steps, start = Steps(quiet), time.perf_counter()
-    picture_size = parsed_size(size)
+    picture_size, t_mdl = parsed_size(size), parsed_error(error)
+    checked_out(out, PICTURES)
     with steps.step("open the device"):
         chosen = clsurf.open_device(device or None)
     steps.say(f"  {chosen.name} ({chosen.platform_name})")
@@ -108,13 +139,13 @@ def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg,
         scan = clsurf.models.demo_scan()
     steps.say(f"  {scan}")
     with steps.step("build the surface"):
-        surface = clsurf.build_slim(scan, degree=degree, error=parsed_error(error), device=chosen,
-                                    progress=steps.progress)
+        surface = clsurf.build_slim(scan, degree=degree, error=t_mdl, device=chosen, progress=steps.progress)
     steps.say(f"  {surface}")
+    camera = clsurf.Camera.framing(surface, aspect=picture_size[0] / picture_size[1])
     with steps.step("draw it"):
-        frame = clsurf.render(surface, size=picture_size, device=chosen)
+        frame = clsurf.render(surface, camera, picture_size, device=chosen)
     with steps.step("draw it again (kernels are ready)"):
-        frame = clsurf.render(surface, size=picture_size, device=chosen)
+        frame = clsurf.render(surface, camera, picture_size, device=chosen)
     with steps.step("write the picture"):
         frame.save(out)
     steps.say(f"picture: {out.resolve()} ({picture_size[0]} x {picture_size[1]}), all in "
@@ -127,8 +158,13 @@ def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg,
 def devices(quiet: QuietOption = False):
     """List the OpenCL devices, the default one marked."""
     from .device import all_devices, choose_device, open_device
-    found = all_devices()
-    default = choose_device(os.environ.get("CLSURF_DEVICE", ""))
+    found, named = all_devices(), os.environ.get("CLSURF_DEVICE", "")
+    try:
+        default = choose_device(named)
+    except Error:
+        if not found:
+            raise
+        default = None
     for cl_device in found:
         device = open_device(cl_device)
         form = f"{device.lanes} lanes a work-item" if device.lanes > 1 else "a work-group per tile"
@@ -138,6 +174,9 @@ def devices(quiet: QuietOption = False):
             continue
         print(f"{mark} {device.name}\n    {device.platform_name}, {device.kind}, {device.units} units, "
               f"{device.memory_bytes / 1e9:.1f} GB, {device.version}, driver {device.driver}, {form}")
+    if default is None:
+        print(f"clsurf: CLSURF_DEVICE={named} names none of them", file=sys.stderr)
+        raise typer.Exit(2)
     if not quiet:
         print("* is the default; choose with --device NAME or CLSURF_DEVICE=NAME")
 
@@ -166,14 +205,16 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")]):
     thing = clsurf.load(path)
     print(thing)
     low, high = thing.bounds
-    print(f"bounds   {low.tolist()} to {high.tolist()}")
+    print("bounds   " + " to ".join("[" + ", ".join(f"{v:.10g}" for v in corner) + "]" for corner in (low, high)))
     if isinstance(thing, SlimSurface):
         leaves = int(thing.leaf.sum())
         print(f"surfels  {len(thing):,}, of which {leaves:,} leaves on {int(thing.level.max(initial=0))} levels, "
               f"{len(thing.children):,} links")
         print(f"floats   {FLOATS[thing.degree] * leaves:,} in the leaves, {FLOATS[thing.degree]} a surfel")
-        print(f"error    T_MDL {thing.error:g} of the diagonal {thing.diagonal:g}; bound {thing.bound:g} for "
-              f"{thing.bound_share:.1%} of the scan's points")
+        error = "T_MDL not stored" if math.isnan(thing.error) else f"T_MDL {thing.error:g}"
+        bound = "not stored" if math.isnan(thing.bound) else \
+            f"{thing.bound:g} for {thing.bound_share:.1%} of the scan's points"
+        print(f"error    {error}, diagonal {thing.diagonal:g}; bound {bound}")
         return
     print("points   " + ", ".join(f"{name} {'yes' if getattr(thing, name, None) is not None else 'no'}"
                                   for name in ("normals", "colors")))
@@ -187,13 +228,13 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
     """Turn a scan into a SLIM surface."""
     import clsurf
     steps = Steps(quiet)
-    if out.suffix not in (".clsurf", ".slim2t"):
-        raise InputError(f"output {out}: expected a name that ends in .clsurf or .slim2t")
+    t_mdl = parsed_error(error)
+    checked_out(out, (".clsurf", ".slim2t"))
     with steps.step("load"):
         loaded = clsurf.load(scan)
     steps.say(f"  {loaded}")
     with steps.step("build"):
-        surface = clsurf.build_slim(loaded, degree=degree, error=parsed_error(error), device=device or None,
+        surface = clsurf.build_slim(loaded, degree=degree, error=t_mdl, device=device or None,
                                     progress=steps.progress)
     steps.say(f"  {surface}\n  within {surface.bound:g} of {surface.bound_share:.1%} of the scan's points")
     with steps.step("save"):
@@ -207,12 +248,16 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
             quiet: QuietOption = False):
     """Write a scan or a surface in another format."""
     import clsurf
+
+    from .io.dispatch import WRITES
     steps = Steps(quiet)
+    checked_out(out, WRITES)
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
     with steps.step("save"):
         clsurf.save(thing, out)
+    steps.say(f"written: {out.resolve()}")
 
 
 @app.command()
@@ -222,7 +267,8 @@ def render(source: Annotated[Path, typer.Argument(help="A surface, or a scan (it
            direction: Annotated[str, typer.Option(help="From the target to the eye: x,y,z.")] = "1,0.5,2",
            up: Annotated[str, typer.Option(help="Upward: x,y,z.")] = "0,1,0",
            fov: Annotated[float, typer.Option(help="Vertical field of view, degrees.")] = 40.0,
-           channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id.")] = "color,depth,normal",
+           channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id; .png and "
+                                                      ".jpg show color.")] = "color,depth,normal",
            shading: Annotated[str, typer.Option(help="phong, flat, ball_size or ball_level.")] = "phong",
            lod: Annotated[float, typer.Option(help="Projected diameter in pixels below which coarser surfels serve; 8 "
                                               "is the fast mode, 0 draws leaves only.")] = 4.0,
@@ -233,22 +279,30 @@ def render(source: Annotated[Path, typer.Argument(help="A surface, or a scan (it
     import clsurf
 
     from .device import Profile
-    steps, picture_size = Steps(quiet), parsed_size(size)
+    from .render.renderer import checked_channels, checked_lod, checked_size
+    # Every option is checked before the work.
+    steps, picture_size, t_mdl = Steps(quiet), checked_size(parsed_size(size)), parsed_error(error)
+    wanted = checked_channels(filter(None, channels.split(",")))
+    checked_out(out, PICTURES)
+    if out.suffix.lower() != ".exr" and "color" not in wanted:
+        raise InputError(f"channels: expected color among them for a {out.suffix} picture, got {channels}: add it, or "
+                         "write .exr")
+    toward, upward = parsed_vector("direction", direction), parsed_vector("up", up)
+    if not 0 < fov < 180:
+        raise InputError(f"fov: expected degrees between 0 and 180, got {fov:g}")
+    looks, lod = clsurf.Shading(look=shading), checked_lod(lod)
     chosen = clsurf.open_device(device or None)
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
     if isinstance(thing, clsurf.Mesh | clsurf.PointCloud):
         with steps.step("build"):
-            thing = clsurf.build_slim(thing, degree=degree, error=parsed_error(error), device=chosen,
-                                      progress=steps.progress)
+            thing = clsurf.build_slim(thing, degree=degree, error=t_mdl, device=chosen, progress=steps.progress)
         steps.say(f"  {thing}")
-    camera = clsurf.Camera.framing(thing, parsed_vector("direction", direction), fov, parsed_vector("up", up),
-                                   aspect=picture_size[0] / picture_size[1])
+    camera = clsurf.Camera.framing(thing, toward, fov, upward, aspect=picture_size[0] / picture_size[1])
     chosen.profile = Profile() if profile else None
     with steps.step("draw"):
-        frame = clsurf.render(thing, camera, picture_size, channels=tuple(filter(None, channels.split(","))),
-                              shading=shading, lod=lod, device=chosen)
+        frame = clsurf.render(thing, camera, picture_size, wanted, looks, lod, device=chosen)
     if profile:
         print(chosen.profile)
         chosen.profile = None
@@ -294,6 +348,8 @@ def main(arguments: list[str] | None = None) -> int:
     import logging
 
     from rich.logging import RichHandler
+    if sys.stderr is None:  # closed by the caller: nothing can be said to it
+        sys.stderr = open(os.devnull, "w")
     quiet = any(a in ("-q", "--quiet") for a in (sys.argv[1:] if arguments is None else arguments))
     handler = RichHandler(show_time=False, show_path=False, show_level=False) if sys.stderr.isatty() \
         else logging.StreamHandler()
@@ -301,7 +357,13 @@ def main(arguments: list[str] | None = None) -> int:
     logger.addHandler(handler)
     logger.setLevel(logging.ERROR if quiet else logging.INFO)
     try:
-        app(arguments, standalone_mode=False)
+        # The option parser turns Ctrl-C and an exit asked for into a code that it returns.
+        code = app(arguments, standalone_mode=False) or 0
+        if code == 130:
+            print("clsurf: stopped", file=sys.stderr)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
     except Error as error:
         print(f"clsurf: {error}", file=sys.stderr)
         return 2
@@ -318,7 +380,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("clsurf: not enough memory: use a smaller scan or picture", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"clsurf: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
+        print(f"clsurf: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
         return 2
     except Exception as error:
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
@@ -328,7 +390,6 @@ def main(arguments: list[str] | None = None) -> int:
         raise
     finally:
         logger.removeHandler(handler)
-    return 0
 
 
 if __name__ == "__main__":

@@ -507,7 +507,7 @@ def test_real_clouds():
     happy = load(scan_path("range_scans/happy/happyStandRight_0.ply"))
     assert isinstance(happy, PointCloud) and len(happy.points) == 78_056
     spot = load(scan_path("textured/spot.obj"))
-    assert spot.texture.shape == (616, 774, 4) and spot.uv.shape == (3_225, 2)
+    assert spot.texture is None and spot.uv.shape == (3_225, 2)  # spot.png shows the model; no .mtl names it
 
 
 def test_autzen_coordinates():

@@ -4,12 +4,13 @@ import importlib.metadata
 import os
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from ..errors import DeviceError, Error
 from . import icd
-from .context import Device, all_devices, open_device
+from .context import Device, all_devices, choose_device, open_device
 from .sources import kernel_folder
 
 
@@ -28,8 +29,9 @@ def examine() -> list[Finding]:
     findings = [_python(), _kernels(), _cache(), *_drivers()]
     devices = all_devices()
     if not devices:
-        findings.append(Finding("device", False, "no OpenCL device found", "pip install pocl-binary-distribution"))
+        findings.append(_no_device(writable_cache=findings[2].good))
     findings += [_device(d) for d in devices]
+    findings += _choice() if devices else []
     findings += [_package("laspy", "LAS and LAZ point clouds"), _package("lazrs", "compressed LAZ"),
                  _package("trimesh", "mesh formats"), _package("OpenImageIO", "pictures")]
     return findings
@@ -52,8 +54,9 @@ def _kernels() -> Finding:
 def _cache() -> Finding:
     folder = icd.cache_folder()
     named = os.environ.get("POCL_CACHE_DIR")
-    if named and not os.access(named if os.path.isdir(named) else os.path.dirname(named) or ".", os.W_OK):
-        return Finding("cache", False, f"POCL_CACHE_DIR={named} cannot be written", "unset POCL_CACHE_DIR")
+    if named and not icd.can_be_made(Path(named)):
+        return Finding("cache", False, f"POCL_CACHE_DIR={named} cannot be written, without it PoCL has no device",
+                       "unset POCL_CACHE_DIR")
     return Finding("cache", True, str(folder))
 
 
@@ -74,6 +77,28 @@ def _drivers() -> list[Finding]:
     if icd.nvidia_library():
         findings.append(Finding("NVIDIA driver", True, icd.nvidia_library()))
     return findings
+
+
+def _no_device(writable_cache: bool) -> Finding:
+    name = "pocl-binary-distribution"
+    try:
+        version = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return Finding("device", False, "no OpenCL device found", f"pip install {name}")
+    detail = f"no OpenCL device found, though {name} {version} is installed"
+    if not writable_cache:
+        return Finding("device", False, f"{detail}: PoCL cannot write its cache", "unset POCL_CACHE_DIR")
+    return Finding("device", False, detail, f"pip install --force-reinstall {name}")
+
+
+def _choice() -> list[Finding]:
+    named = os.environ.get("CLSURF_DEVICE")
+    if not named:
+        return []
+    try:
+        return [Finding("CLSURF_DEVICE", True, f"{named}: {choose_device(named).name.strip()}")]
+    except Error:
+        return [Finding("CLSURF_DEVICE", False, f"{named} names none of the devices", "unset CLSURF_DEVICE")]
 
 
 def _device(cl_device) -> Finding:

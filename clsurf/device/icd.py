@@ -37,6 +37,14 @@ def cache_folder() -> Path:
     return base
 
 
+def can_be_made(folder: Path) -> bool:
+    """Whether `folder` is there and can be written, or can be made."""
+    folder = folder.absolute()
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
 def intel_library() -> Path | None:
     """Return the path of pip's Intel CPU runtime, or None."""
     candidates = [Path(sys.prefix) / "lib" / "libintelocl.so"]
@@ -81,6 +89,10 @@ def prepare() -> None:
     if _prepared or not sys.platform.startswith("linux"):
         return
     _prepared = True
+    # PoCL has no device where it cannot make its cache: a home that cannot be written (containers, services).
+    pocl = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/tmp") / ".cache") / "pocl"
+    if not os.environ.get("POCL_CACHE_DIR") and not can_be_made(pocl / "kcache"):
+        os.environ["POCL_CACHE_DIR"] = str(cache_folder() / "pocl")
     if os.environ.get("OCL_ICD_VENDORS"):
         return
     entries = wanted_entries()

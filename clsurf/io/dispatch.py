@@ -10,6 +10,7 @@ from clsurf.surface.slim import SlimSurface
 from . import scans
 
 SURFACES = (".clsurf", ".slim2t")
+WRITES = (*scans.WRITES, *SURFACES)
 
 
 def load(path):

@@ -38,6 +38,29 @@ def existing_file(path) -> Path:
     return path
 
 
+def writable_place(path) -> Path:
+    """Return `path` as a Path in an existing folder that may be written.
+
+    Raises
+    ------
+    InputError
+        The folder is missing or not writable, or `path` is a folder.
+    """
+    path = _as_path(path)
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: expected a file name, got a folder")
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: the folder {path.parent} does not exist: make it first")
+        if not os.access(path.parent, os.W_OK):
+            raise InputError(f"{path}: the folder {path.parent} cannot be written: choose another")
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: cannot be written: {_reason(error)}") from None
+    return path
+
+
 @contextlib.contextmanager
 def replacing(path) -> Iterator[Path]:
     """Give a temporary path beside `path` with the same ending; move it over `path` once the block has succeeded.
@@ -49,16 +72,7 @@ def replacing(path) -> Iterator[Path]:
     InputError
         The folder is missing or not writable, the disk is full, or `path` is a folder.
     """
-    path = _as_path(path)
-    try:
-        if path.is_dir():
-            raise InputError(f"{path}: expected a file name, got a folder")
-        if not path.parent.is_dir():
-            raise InputError(f"{path}: the folder {path.parent} does not exist: make it first")
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be written: {_reason(error)}") from None
+    path = writable_place(path)
     temporary = path.with_name(f".{path.stem[:40]}.{uuid.uuid4().hex[:12]}{path.suffix}")
     try:
         yield temporary
@@ -75,6 +89,11 @@ def _as_path(path) -> Path:
         return Path(os.fspath(path)).expanduser()
     except (TypeError, RuntimeError):
         raise InputError(f"path: expected a file name, got {type(path).__name__}") from None
+
+
+def write_array(file, rows) -> None:
+    """Write a NumPy array to an open file; unlike `tofile`, a full disk is told as such."""
+    file.write(memoryview(rows).cast("B") if rows.size else b"")
 
 
 def one_line(error: BaseException) -> str:

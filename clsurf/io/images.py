@@ -17,6 +17,7 @@ ENDINGS = (*EIGHT_BIT, ".exr")
 # Channel names of a frame's arrays in an EXR file; others are called by the name of their array.
 EXR_NAMES = {"color": ("R", "G", "B", "A"), "depth": ("Z",), "normal": ("N.X", "N.Y", "N.Z"),
              "position": ("P.X", "P.Y", "P.Z")}
+_LARGEST_JPEG = 65500
 _MOST_COMPRESSED = 4000  # pixel bytes per file byte; deflate reaches 1032, so a larger claim is a damaged header
 
 
@@ -110,11 +111,12 @@ def write_image(path, pixels, background=None) -> None:
         if pixels.dtype != np.uint8:
             raise InputError("pixels: .jpg holds 8 bits a channel, got uint16: write .png instead")
         pixels = pixels[..., :3]
+    if jpeg:
+        _write_jpeg(path, pixels)
+        return
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], pixels.dtype.name)
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("oiio:ColorSpace", "sRGB")
-    spec.attribute("CompressionQuality", 95)
-    spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", 4)
     _write(path, spec, np.ascontiguousarray(pixels))
 
@@ -224,6 +226,20 @@ def _write_exr(path: Path, planes: dict[str, NDArray]) -> None:
     _write(path, spec, np.stack([np.asarray(plane, np.float32) for plane in planes.values()], axis=-1))
 
 
+def _write_jpeg(path: Path, pixels: NDArray) -> None:
+    """Write (h, w, 1 or 3) uint8 through memory: on a full disk OpenImageIO's JPEG writer ends the whole process."""
+    from PIL import Image
+    if 0 in pixels.shape:
+        raise InputError(f"{path}: expected a picture of at least one pixel, got {pixels.shape[1]} x {pixels.shape[0]}")
+    if max(pixels.shape[:2]) > _LARGEST_JPEG:
+        raise InputError(f"{path}: .jpg holds up to {_LARGEST_JPEG} pixels a side, got {pixels.shape[1]} x "
+                         f"{pixels.shape[0]}: write .png instead")
+    buffer = io.BytesIO()
+    Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).save(buffer, "JPEG", quality=95, subsampling=0)
+    with replacing(path) as temporary:
+        temporary.write_bytes(buffer.getvalue())
+
+
 def _write(path: Path, spec, pixels: NDArray) -> None:
     if 0 in pixels.shape:
         raise InputError(f"{path}: expected a picture of at least one pixel, got {pixels.shape[1]} x {pixels.shape[0]}")
@@ -235,8 +251,17 @@ def _write(path: Path, spec, pixels: NDArray) -> None:
         message = "" if good else _oiio_error(sink)
         if not sink.close() and good:
             good, message = False, _oiio_error(sink)
+        if good and path.suffix.lower() == ".png" and not _png_ends(temporary):
+            good, message = False, "disk full?"  # which OpenImageIO's PNG writer does not notice
         if not good:
             raise InputError(f"{path}: cannot be written: {message.replace(str(temporary), str(path))}")
+
+
+def _png_ends(path: Path) -> bool:
+    """Whether the PNG file at `path` has its last chunk."""
+    with open(path, "rb") as file:
+        file.seek(-min(12, path.stat().st_size), 2)
+        return file.read()[4:8] == b"IEND"
 
 
 def _as_pixels(pixels, background) -> NDArray:

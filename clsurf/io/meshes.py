@@ -16,18 +16,18 @@ from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
 from .colors import as_rgba8
-from .images import read_image, write_image
+from .files import write_array
+from .images import write_image
 from .rows import BLOCK, digits_of, world_of, write_rows
 
-_PICTURES = (".png", ".jpg", ".jpeg")
 _NO_PICTURE = (2, 2)  # what trimesh puts where a material names no picture
 
 
 def read_mesh(path: Path) -> Mesh | PointCloud:
     """Read a mesh with its vertices unmerged and in order; a scene's parts are placed and put together.
 
-    A vertex of an OBJ file with several texture coordinates becomes one vertex for each (a seam). Where an OBJ file has
-    coordinates but names no picture, a picture of the same name beside it is taken.
+    A vertex of an OBJ file with several texture coordinates becomes one vertex for each (a seam). Only a picture that
+    the file names is its texture: one of the same name beside it may be a rendering of it, ours among them.
 
     Raises
     ------
@@ -106,24 +106,16 @@ def _mesh_of(part: trimesh.Trimesh, path: Path) -> Mesh:
                           else trimesh.visual.color.face_to_vertex_color(part, visual.face_colors))
     elif visual.kind == "texture" and np.shape(getattr(visual, "uv", None)) == (count, 2):
         uv = np.asarray(visual.uv, np.float32)
-        texture = _texture_of(visual.material, path)
+        texture = _texture_of(visual.material)
     return Mesh(points, faces, normals, colors, uv, texture)
 
 
-def _texture_of(material, path: Path) -> NDArray | None:
-    """Return the picture (h, w, 4) uint8 of a material, or the one beside an OBJ file, or None."""
+def _texture_of(material) -> NDArray | None:
+    """Return the picture (h, w, 4) uint8 of a material, or None."""
     picture = getattr(material, "baseColorTexture", None)
     picture = getattr(material, "image", None) if picture is None else picture
     if picture is not None and picture.size != _NO_PICTURE:
         return np.array(picture.convert("RGBA"))
-    if path.suffix.lower() == ".obj":
-        for ending in _PICTURES:
-            beside = path.with_suffix(ending)
-            if beside.is_file():
-                pixels = read_image(beside)
-                pixels = (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
-                pixels = pixels[..., [0, 0, 0]] if pixels.shape[2] < 3 else pixels
-                return as_rgba8(pixels.reshape(-1, pixels.shape[2])[:, :4]).reshape(*pixels.shape[:2], 4)
     return None
 
 
@@ -188,7 +180,7 @@ def _write_stl(scan: Mesh, path: Path) -> None:
     rows["corners"] = corners
     with open(path, "wb") as file:
         file.write(b"clsurf".ljust(80, b" ") + struct.pack("<I", len(rows)))
-        rows.tofile(file)
+        write_array(file, rows)
 
 
 def _write_obj(scan, path: Path) -> None:

@@ -15,6 +15,7 @@ from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
 from .colors import as_rgba8
+from .files import write_array
 from .rows import numbers_in
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -351,8 +352,8 @@ def write_ply(scan: Mesh | PointCloud, path: Path) -> None:
         if faces is not None:
             header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
         file.write(("\n".join([*header, "end_header"]) + "\n").encode())
-        rows.tofile(file)
+        write_array(file, rows)
         if faces is not None:
             lists = np.empty(len(faces), [("n", "u1"), ("v", "<i4", (3,))])
             lists["n"], lists["v"] = 3, faces
-            lists.tofile(file)
+            write_array(file, lists)

@@ -38,6 +38,7 @@ def save_store(thing, path) -> None:
     kind, arrays, values = to_arrays(thing)
     attributes = {"format": "clsurf", "version": VERSION, "kind": kind, "values": values}
     with replacing(path) as temporary:
+        temporary.touch()  # a place that cannot be written is told here: closing a store that never opened fails
         store = ZipStore(temporary, mode="w")
         try:
             # Attributes are given here: a later update would put a second zarr.json into the zip.
