@@ -138,6 +138,19 @@ def test_covers_two_sheets(device):
     assert (np.einsum("ij,ij->i", near.normal, normals) > 0.5).mean() > 0.98
 
 
+def test_thin_and_sparse(device):
+    """Two sheets of opposite normals, closer than a few point spacings: neither pulls the other's leaves."""
+    top, normal = torus(1500)
+    points, normals = np.concatenate([top, top - 0.06 * normal]), np.concatenate([normal, -normal])
+    surface = build_slim(PointCloud(points, normals=normals), device=device)
+    away = np.abs(np.hypot(np.hypot(*surface.centers[:, :2].T + surface.origin[:2, None]) - 1,
+                           surface.centers[:, 2] + surface.origin[2]) - 0.4)
+    assert ((away < 1e-5) | (np.abs(away - 0.06) < 1e-5)).all()
+    near = project(surface, points, device=device)
+    assert np.sqrt((near.distance**2).mean()) < 5e-3
+    assert (np.einsum("ij,ij->i", near.normal, normals) > 0.7).mean() > 0.97
+
+
 def test_same_input_same_bytes(device):
     scan = cloud_of(torus, 8000)
     first, second = (build_slim(scan, degree=3, device=device) for _ in range(2))

@@ -159,6 +159,29 @@ def test_fit_surfels(tree, sorted_points, degree):
     assert agree > 0.9 * 2 * len(centers) - 20
 
 
+def test_fit_leaves_sheet_behind_out(device):
+    """Sparse points, two bent sheets nearer to each other than a ball is wide: every leaf is of its own sheet."""
+    points, normals = wavy_sheet(700)
+    points, normals = np.concatenate([points, points - 0.02 * normals]), np.concatenate([normals, -normals])
+    tree = point_tree.build_point_tree(points, normals, np.zeros(3, np.float32), 1.0, device)
+    host = device.download(tree.sorted)[:, :tree.count].astype(float)
+    centers = np.arange(0, tree.count, 10)
+    record, need = fitted(tree, 2, centers, 0.09, penalty=1e-12)
+    agree = 0
+    for c, got in zip(centers, record.astype(float), strict=True):
+        inside = ((host[:3].T - host[:3, c]) ** 2).sum(axis=1) < 0.09**2
+        if inside.sum() < need or (inside & (host[3:].T @ host[3:, c] > -0.2)).sum() < twin.terms(2):
+            continue
+        radius_, normal, e, leaf, _ = twin.fit_surfels(host[:3].T, host[3:].T, c, 0.09, LAMBDA, 1e-12, need, 2)
+        if got[5]:
+            assert got[1:4] @ host[3:, c] > 0.9
+            assert got[4] < 0.003  # 0.01 with both sheets
+        if leaf and got[5] and abs(got[0] - radius_) < 1e-4 * radius_:
+            agree += 1
+            assert normal @ got[1:4] > 1 - 1e-6 and got[4] == pytest.approx(e, rel=1e-2, abs=1e-6)
+    assert agree > 0.6 * len(centers)
+
+
 def test_fit_of_thinned_ball(device):
     points, normals = wavy_sheet(20000, noise=1e-3)
     tree = point_tree.build_point_tree(points, normals, np.zeros(3, np.float32), 1.0, device)

@@ -13,13 +13,23 @@
 #define FORCED 1  // the same, but always a leaf
 #define FIXED 2   // always a leaf, with radius r_r
 #define INNER 3   // never a leaf
-#define CUBIC_LIMIT 1.0f // |c r^2| of a cubic term; beyond it the cubic terms of a lane are dropped
-#define NORMAL_SHARE 0.618034f // of r_r: the ball whose mean normal sets the frame
-#define COMPANY 5  // points of a ball; fewer is alone
+#define RECORD 16 // floats out: radius, normal, e, leaf, coefficients from 6
+
+#define CUBIC_LIMIT 1.0f       // |c r^2| of a cubic term; beyond it the cubic terms of a lane are dropped
+#define NORMAL_SHARE 0.618034f // of the radius: the ball whose mean normal sets the frame
+// A true minimum of E has e^2 = lambda (T/r)^2 / (degree + 1), above the noise; e^2 far above it is a plateau: detail
+// smoothed away between two scales (the demo's flutes and rosettes: 12 leaves of 16K, e^2 up to 2000 times the penalty).
+#define PLATEAU 4.0f
+#define NOISE_ALLOWED 3.0f // lambdas of e^2; lambda is about 0.7 of the noise's variance
+// Points whose normals have a smaller cosine with the centre's are of the sheet behind. Right angles stay in: taken
+// apart from 0.3 on, a cube-like edge (fandisk) lets large leaves stand out over it, RMS 0.07 to 0.46 % of the diagonal.
+#define OTHER_SHEET -0.2f
 #define SPARSE 6.0f    // point spacings: a quarter of a disc of that radius has more points than a quadratic needs
+#define COMPANY 5      // points of a wide ball; fewer is alone
+#define COMPACT 0.25f  // of r_r^2: a ball whose points all lie nearer is an island
 #define POOR 0.05f     // e over the radius: a grown ball that fits worse is left to the next levels
 #define LONE_DISC 3.0f // point spacings
-#define RECORD 16 // floats out: radius, normal, e, leaf, coefficients from 6
+#define ANY_NORMAL ((float4)(0.0f, 0.0f, 0.0f, 0.0f)) // of gather_ball's side
 
 #ifdef WEIGHTED
 #define TIMES_WEIGHT(g, i, p) g *= ((const float *)ball->k)[16 * (i) + (p)];
@@ -37,17 +47,19 @@ typedef struct {
   float ux, uy, uz, vx, vy, vz, nx, ny, nz;
 } Frame;
 
-// The frame of the ball's mean normal, nudged off the frame's seam z = 0: a stored normal decodes to within rounding,
-// which must not carry it over the seam. Where the sum vanishes (two sheets), the centre's own normal is taken.
-inline Frame frame_of_ball(const Ball *ball, float own_x, float own_y, float own_z) {
+// Nudges a normal off the frame's seam z = 0: a stored one decodes to within rounding, which must not carry it over.
+inline float off_seam(float z) { return z < 1e-5f && z > -1e-5f ? (z < 0.0f ? -1e-5f : 1e-5f) : z; }
+
+// The frame of the ball's mean normal. Where the sum vanishes (two sheets), the centre's own normal is taken.
+inline Frame frame_of_ball(const Ball *ball, float3 own_normal) {
   float3 n = (float3)(ball->normal_x, ball->normal_y, ball->normal_z), u, v;
   float s = n.x * n.x + n.y * n.y + n.z * n.z;
   if (!(s > 1e-12f)) {
-    n = (float3)(own_x, own_y, own_z);
+    n = own_normal;
     s = 1.0f;
   }
   n *= 1.0f / sqrt(s);
-  if (n.z < 1e-5f && n.z > -1e-5f) n.z = n.z < 0.0f ? -1e-5f : 1e-5f;
+  n.z = off_seam(n.z);
   frame_of_normal(n, &u, &v);
   Frame f = {u.x, u.y, u.z, v.x, v.y, v.z, n.x, n.y, n.z};
   return f;
@@ -133,22 +145,23 @@ inline void fit_polynomials(const VF *moment, const VF *right, VF r, int terms, 
   for (int k = 0; k < TERMS; ++k) c[k] = SEL((VF)0.0f, c[k], (c[k] > -1e6f) & (c[k] < 1e6f));
 }
 
-#define EACH_CHUNK(body)                                                                                          \
-  {                                                                                                               \
-    uint list[BLOCK_LIST];                                                                                        \
-    Traversal t;                                                                                                  \
-    int blocks;                                                                                                   \
-    traversal_start(&t, top_level);                                                                               \
-    while ((blocks = traversal_next(&t, boxes, node_offset, x, y, z, radius * radius, list)) > 0)                 \
-      for (int b = 0; b < blocks; ++b) {                                                                          \
-        __global const float16 *block = (__global const float16 *)sorted + list[b];                               \
-        Chunk c;                                                                                                  \
-        local_chunk(&c, block[0] - x, block[padded / 16] - y, block[2 * (size_t)(padded / 16)] - z, frame, inverse_r); \
-        float16 g = 1.0f - c.d2.v;                                                                                \
-        g = SEL(g, (float16)0.0f, g < 0.0f);                                                                      \
-        g = POINT_WEIGHT(g * g * g, block, (size_t)(padded / 16));                                                \
-        body                                                                                                      \
-      }                                                                                                           \
+#define EACH_CHUNK(body)                                                                              \
+  {                                                                                                   \
+    size_t n16 = padded / 16;                                                                         \
+    uint list[BLOCK_LIST];                                                                            \
+    Traversal t;                                                                                      \
+    int blocks;                                                                                       \
+    traversal_start(&t, top_level);                                                                   \
+    while ((blocks = traversal_next(&t, boxes, node_offset, x, y, z, radius * radius, list)) > 0)     \
+      for (int b = 0; b < blocks; ++b) {                                                              \
+        __global const float16 *block = (__global const float16 *)sorted + list[b];                   \
+        Chunk c;                                                                                      \
+        local_chunk(&c, block[0] - x, block[n16] - y, block[2 * n16] - z, frame, inverse_r);          \
+        float16 g = 1.0f - c.d2.v;                                                                    \
+        g = SEL(g, (float16)0.0f, g < 0.0f);                                                          \
+        g = POINT_WEIGHT(g * g * g, block, n16);                                                      \
+        body                                                                                          \
+      }                                                                                               \
   }
 
 // The fit over all points of one radius, points as lanes: what the thinned ball chose is made exact. Coefficients in
@@ -179,52 +192,101 @@ inline float turn_to_plane(const Frame *f, VF *normal, VF *c) {
 }
 #endif
 
-// The lane to take: a leaf's, or 14 for an internal surfel.
-inline int choose_lane(const float *energy, const float *e2, const int *count, float lambda, int need, int mode,
-                       int stride, int *leaf) {
+// The fits of all lanes: error and energy in unit-diagonal units, coefficients in units of the ball's radius.
+typedef struct {
+  Frame frame;
+  VF c[TERMS], weight; // weight: the sum of G over the points
+  union { VF v; float s[16]; } e2, energy;
+  union { VI v; int s[16]; } count;
+} Fits;
+
+inline void fit_lanes(Fits *fits, const Ball *ball, float3 own_normal, float radius, VF r, int terms, float lambda_t2) {
+  VF inverse_r2 = 1.0f / (r * r), moment[MOMENTS], right[TERMS];
+  fits->frame = frame_of_ball(ball, own_normal);
+  sum_moments(ball, &fits->frame, 1.0f / radius, inverse_r2, moment, right, &fits->count.v);
+  fit_polynomials(moment, right, r, terms, fits->c);
+  fits->weight = moment[0];
+  fits->e2.v = mean_residual2(ball, &fits->frame, 1.0f / radius, inverse_r2, fits->c) * (radius * radius);
+  fits->energy.v = fits->e2.v + inverse_r2 * (lambda_t2 / (radius * radius));
+}
+
+// The first lane with at least `need` points; 14 where none has.
+inline int lowest_lane(const Fits *fits, int need) {
   int lowest = 14;
-  while (lowest > 0 && count[lowest - 1] >= need) --lowest;
-  int best = 14;
+  while (lowest > 0 && fits->count.s[lowest - 1] >= need) --lowest;
+  return lowest;
+}
+
+inline int is_plateau(const Fits *fits, int lane, float noise) {
+  return fits->e2.s[lane] > PLATEAU * (fits->energy.s[lane] - fits->e2.s[lane]) + noise;
+}
+
+// The lane to take: a leaf's, or 14 for an internal surfel.
+inline int choose_lane(const Fits *fits, float lambda, int need, int mode, int stride, int *leaf) {
+  const float *e2 = fits->e2.s, *energy = fits->energy.s;
+  int lowest = lowest_lane(fits, need), best = 14;
   for (int i = 13; i >= lowest; --i)
     if (energy[i] < energy[best]) best = i;
   if (mode == FIXED) best = 14;
-  // A leaf: an interior minimum with e rising (condition 4), E still falling at r_r, or no smaller radius to try.
+  // A leaf: an interior minimum with e rising (condition 4), E still falling at r_r, or no smaller radius to try. Finer
+  // levels resolve a plateau.
   int middle = lowest > 7 ? lowest : 7;
   int rising = e2[lowest] <= e2[middle] && e2[middle] <= e2[14];
-  // A true minimum has e^2 = lambda (T/r)^2 / (degree + 1), above the noise; far above it e is a plateau: detail smoothed
-  // away between two scales (the demo's flutes and rosettes: 12 leaves of 16K, e^2 up to 2000 times the penalty). Finer
-  // levels resolve it. lambda is about 0.7 of the noise's variance.
-  int plateau = lowest == 0 && e2[best] > 4.0f * (energy[best] - e2[best]) + 3.0f * lambda;
+  int plateau = lowest == 0 && is_plateau(fits, best, NOISE_ALLOWED * lambda);
   *leaf = !plateau && (best == 14 || (best > lowest && rising) || (best == lowest && lowest > 0 && stride == 1));
   if (mode != SEGMENT) *leaf = mode != INNER;
   return *leaf ? best : 14;
 }
 
 // A small disc with the point's own normal.
-inline void write_disc(__global float *o, float radius, float x, float y, float z) {
+inline void write_disc(__global float *o, float radius, float3 normal) {
   for (int i = 0; i < RECORD; ++i) o[i] = 0.0f;
   o[0] = radius;
-  o[1] = x;
-  o[2] = y;
-  o[3] = z < 1e-5f && z > -1e-5f ? (z < 0.0f ? -1e-5f : 1e-5f) : z;
+  o[1] = normal.x;
+  o[2] = normal.y;
+  o[3] = off_seam(normal.z);
   o[5] = 1.0f;
 }
 
-// A ball with too few points grows, to twice its size or to SPARSE point spacings, and makes do with a plane if it then
-// still has too few; a point that is nearly alone gets a disc. Where the points fill less than half of the ball (a small
-// island), the next levels' smaller balls decide: grown, it would bridge to the next surface.
-__kernel void fit_surfels(int surfels, __global const int *center, float r_r, float lambda, float lambda_t2, float spacing, int need, int mode,
-                          int padded, __global const float *sorted, __global const float *boxes,
-                          __global const int *node_offset, int top_level, __global float *out) {
+inline void write_surfel(__global float *o, const Frame *frame, const VF *coefficient, float radius, float share,
+                         float error2, int leaf) {
+  VF c[TERMS], normal[3] = {frame->nx, frame->ny, frame->nz};
+  for (int k = 0; k < TERMS; ++k) c[k] = coefficient[k];
+#if DEGREE == 1
+  error2 *= turn_to_plane(frame, normal, c);
+#endif
+  o[0] = share * radius;
+  for (int a = 0; a < 3; ++a) o[1 + a] = ((float *)&normal[a])[0];
+  o[4] = sqrt(error2);
+  o[5] = leaf;
+  float scale[4] = {radius, 1.0f, 1.0f / radius, 1.0f / (radius * radius)}; // out of the units of the radius
+  for (int k = 0; k < 10; ++k) o[6 + k] = 0.0f;
+  for (int k = 0; k < (DEGREE == 1 ? 1 : TERMS); ++k)
+    o[6 + k] = ((float *)&c[k])[0] * scale[TERM_U[k] + TERM_V[k]];
+}
+
+#define GATHER(side)                                                                                           \
+  gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius, side)
+
+// Sparse places. A ball with too few points grows, to twice its size or to SPARSE point spacings, and makes do with a
+// plane if it then still has too few; a point that is nearly alone gets a disc. Where the points fill less than half of
+// the ball (an island), the next levels' smaller balls decide: grown, it would bridge to the next surface. A leaf that
+// has no smaller radius to try and fits badly because a sheet behind is in its ball is fitted once more without it.
+__kernel void fit_surfels(int surfels, __global const int *center, float r_r, float lambda, float lambda_t2,
+                          float spacing, int need, int mode, int padded, __global const float *sorted,
+                          __global const float *boxes, __global const int *node_offset, int top_level,
+                          __global float *out) {
   int s = get_global_id(0);
   if (s >= surfels) return;
-  int own = center[s];
-  float x = sorted[own], y = sorted[padded + (size_t)own], z = sorted[2 * (size_t)padded + own];
+  __global const float *own = sorted + center[s];
+  size_t n = padded;
+  float x = own[0], y = own[n], z = own[2 * n];
+  float3 own_normal = (float3)(own[3 * n], own[4 * n], own[5 * n]);
   Ball ball;
   float radius = r_r;
-  int terms = TERMS;
-  gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius);
-  int wide = r_r > SPARSE * spacing, compact = wide && ball.extent2 < 0.25f * r_r * r_r;
+  int terms = TERMS, may_refit = mode != FIXED;
+  GATHER(ANY_NORMAL);
+  int wide = r_r > SPARSE * spacing, compact = wide && ball.extent2 < COMPACT * r_r * r_r;
   if (compact && mode == SEGMENT) mode = INNER;
   if (ball.count < need) {
     float limit = compact ? r_r : wide ? 2.0f * r_r : SPARSE * spacing;
@@ -232,11 +294,10 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
     int alone = wide && ball.count < (compact ? 2 : COMPANY);
     while (!alone && ball.count < need && 1.25f * radius <= limit) {
       radius *= 1.25f;
-      gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius);
+      GATHER(ANY_NORMAL);
     }
     if (alone || (wide && !compact && ball.count < need)) {
-      write_disc(out + RECORD * (size_t)s, LONE_DISC * spacing, sorted[3 * (size_t)padded + own],
-                 sorted[4 * (size_t)padded + own], sorted[5 * (size_t)padded + own]);
+      write_disc(out + RECORD * (size_t)s, LONE_DISC * spacing, own_normal);
       return;
     }
     if (ball.count < need) {
@@ -248,44 +309,35 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
   VF r = (VF)(0.381966011f, 0.409151886f, 0.438272665f, 0.469466063f, 0.502879599f, 0.538671289f, 0.577010394f,
               0.618033989f, 0.662021714f, 0.709140230f, 0.759612349f, 0.813676760f, 0.871589122f, 0.933623281f, 1.0f,
               1.0f);
-  VF inverse_r2 = 1.0f / (r * r), moment[MOMENTS], right[TERMS], c[TERMS];
-  union { VI v; int s[16]; } count;
-  Frame frame = frame_of_ball(&ball, sorted[3 * (size_t)padded + own], sorted[4 * (size_t)padded + own],
-                              sorted[5 * (size_t)padded + own]);
-  sum_moments(&ball, &frame, 1.0f / radius, inverse_r2, moment, right, &count.v);
-  fit_polynomials(moment, right, r, terms, c);
-  union { VF v; float s[16]; } e2, energy;
-  e2.v = mean_residual2(&ball, &frame, 1.0f / radius, inverse_r2, c) * (radius * radius);
-  energy.v = e2.v + inverse_r2 * (lambda_t2 / (radius * radius));
-  int leaf, lane = choose_lane(energy.s, e2.s, count.s, lambda, need, mode, ball.stride, &leaf);
+  Fits fits;
+  int leaf, lane;
+  for (int attempt = 0; attempt < 2; ++attempt) {
+    fit_lanes(&fits, &ball, own_normal, radius, r, terms, lambda_t2);
+    lane = choose_lane(&fits, lambda, need, mode, ball.stride, &leaf);
+    int no_smaller = mode != SEGMENT || fits.count.s[0] < need;
+    if (!may_refit || !leaf || !no_smaller || ball.stride > 1 || !is_plateau(&fits, lane, 0.0f)) break;
+    may_refit = 0;
+    GATHER((float4)(own_normal, OTHER_SHEET));
+    need = ball.count < need ? ball.count : need;
+    if (need < TERMS) need = 1, terms = 3, mode = FIXED;
+  }
 #ifndef WEIGHTED
   // Evenly spread points weigh a quarter of their number; a stray whose neighbours all lie near the rim fits itself.
-  if (leaf && wide && mode == SEGMENT && ((float *)&moment[0])[lane] < 0.125f * need) leaf = 0, lane = 14;
+  if (leaf && wide && mode == SEGMENT && ((float *)&fits.weight)[lane] < 0.125f * need) leaf = 0, lane = 14;
 #endif
-  float error2 = e2.s[lane], share = ((float *)&r)[lane];
+  float error2 = fits.e2.s[lane], share = ((float *)&r)[lane];
   if (wide && radius > r_r && mode == FORCED && error2 > POOR * POOR * radius * radius) { // strays, no sparse surface
     leaf = 0;
     share = r_r / radius;
   }
-  for (int k = 0; k < TERMS; ++k) c[k] = ((float *)&c[k])[lane];
+  VF c[TERMS];
+  for (int k = 0; k < TERMS; ++k) c[k] = ((float *)&fits.c[k])[lane];
   if (ball.stride > 1) { // a thinned ball chose the radius; the surfel is fitted to all points
     for (int k = 0; k < TERMS; ++k) c[k] = 0.0f;
-    error2 = fit_all_points(padded, sorted, boxes, node_offset, top_level, x, y, z, share * radius, &frame, c);
+    error2 = fit_all_points(padded, sorted, boxes, node_offset, top_level, x, y, z, share * radius, &fits.frame, c);
     error2 *= share * share * radius * radius;
     radius *= share;
     share = 1.0f;
   }
-  VF normal[3] = {frame.nx, frame.ny, frame.nz};
-#if DEGREE == 1
-  error2 *= turn_to_plane(&frame, normal, c);
-#endif
-  __global float *o = out + RECORD * (size_t)s;
-  o[0] = share * radius;
-  for (int a = 0; a < 3; ++a) o[1 + a] = ((float *)&normal[a])[0];
-  o[4] = sqrt(error2);
-  o[5] = leaf;
-  float scale[4] = {radius, 1.0f, 1.0f / radius, 1.0f / (radius * radius)}; // out of the units of the radius
-  for (int k = 0; k < 10; ++k) o[6 + k] = 0.0f;
-  for (int k = 0; k < (DEGREE == 1 ? 1 : TERMS); ++k)
-    o[6 + k] = ((float *)&c[k])[0] * scale[TERM_U[k] + TERM_V[k]];
+  write_surfel(out + RECORD * (size_t)s, &fits.frame, c, radius, share, error2, leaf);
 }

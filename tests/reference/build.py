@@ -138,7 +138,7 @@ def fit_at(points, normals, center, radius, frame_radius, degree):
     return frame, c, (g * f**2).sum() / g.sum()
 
 
-def fit_surfels(points, normals, center, r_r, noise, penalty, need, degree):
+def fit_surfels(points, normals, center, r_r, noise, penalty, need, degree, refit=True):
     """Radius, normal, e, leaf and coefficients of the surfel at `center` in the segment that ends at r_r."""
     radii = r_r * GOLDEN ** (2 * (14 - np.arange(15)) / 14)
     d2 = ((points - points[center]) ** 2).sum(axis=1)
@@ -153,6 +153,10 @@ def fit_surfels(points, normals, center, r_r, noise, penalty, need, degree):
     plateau = lowest == 0 and e2[best] > 4 * penalty / radii[best] ** 2 + 3 * noise
     leaf = not plateau and (best == 14 or (best > lowest and rising) or (best == lowest and lowest > 0))
     best = best if leaf else 14
+    if refit and leaf and lowest > 0 and e2[best] > 4 * penalty / radii[best] ** 2:  # perhaps a sheet behind
+        own = normals @ normals[center] >= -0.2
+        need = min(need, int((own & (d2 < r_r**2)).sum()))
+        return fit_surfels(points[own], normals[own], own[:center].sum(), r_r, noise, penalty, need, degree, False)
     frame, c, mean2 = fits[best]
     normal = frame[2]
     if degree == 1:
