@@ -7,6 +7,7 @@ xx yy zz xy yz zx, linear x y z, and 1. The radius is that of the shrunken ball 
 (paper, section 3): 2/3 of the full one.
 """
 
+import dataclasses
 import logging
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from clsurf.errors import FileFormatError, InputError
 from clsurf.surface.slim import COEFFICIENTS, SlimSurface, frame_of_normals
 
-from .files import existing_file, replacing
+from .files import existing_file, replacing, write_array
 
 log = logging.getLogger("clsurf")
 
@@ -81,7 +82,7 @@ def load_slim2t(path) -> SlimSurface:
 
 
 def save_slim2t(surface: SlimSurface, path) -> None:
-    """Write a .slim2t file: every surfel, linked to the first of its parents, its fit error as the user value.
+    """Write a .slim2t file: the surfels, each linked to one of its parents, its fit error as the user value.
 
     The format holds neither colours nor footprints nor a float64 origin; centres are float32 world positions.
 
@@ -90,25 +91,53 @@ def save_slim2t(surface: SlimSurface, path) -> None:
     InputError
         More than 2^24 surfels (parents are float32), or a place that cannot be written.
     """
+    if not 0 < len(surface) <= 2**24:
+        raise InputError(f"{path}: .slim2t holds 1 to {2**24:,} surfels, got {len(surface):,}")
+    lost = [name for name in ("colors", "footprint") if getattr(surface, name) is not None]
+    surface, parent = _as_tree(surface)
     count = len(surface)
-    if not 0 < count <= 2**24:
-        raise InputError(f"{path}: .slim2t holds 1 to {2**24:,} surfels, got {count:,}")
     monomials = _POWERS[surface.degree].split()
     rows = np.empty((count, 6 + len(monomials)), "<f4")
     rows[:, :3] = surface.centers + surface.origin
     rows[:, 3:3 + len(monomials)] = _general_forms(surface, monomials)
     rows[:, 3 + len(monomials)] = surface.radii * ALPHA
-    parent = np.full(count, -1, np.int64)
-    owner = np.repeat(np.arange(count), np.diff(surface.child_offset))
-    parent[surface.children[::-1]] = owner[::-1] + 1  # the last assignment stays: the first parent
-    rows[:, 4 + len(monomials)] = parent
+    rows[:, 4 + len(monomials)] = np.where(parent < 0, -1, parent + 1)
     rows[:, 5 + len(monomials)] = surface.fit_error
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        np.array([surface.degree if surface.oriented else -surface.degree, count, 1], "<i4").tofile(file)
-        rows.tofile(file)
-    lost = [name for name in ("colors", "footprint") if getattr(surface, name) is not None]
+        file.write(np.array([surface.degree if surface.oriented else -surface.degree, count, 1], "<i4").tobytes())
+        write_array(file, rows)
     if lost:
         log.info("%s: .slim2t cannot hold %s", Path(path).name, " and ".join(lost))
+
+
+def _as_tree(surface: SlimSurface) -> tuple[SlimSurface, NDArray]:
+    """Return the surface without its links, and one parent (n,) int64 a surfel, -1 at the roots.
+
+    In a tree a surfel without children is a leaf, so an internal one must keep a child. One that cannot is left out.
+    """
+    owner = np.repeat(np.arange(len(surface)), np.diff(surface.child_offset))
+    parent = np.full(len(surface), -1, np.int64)
+    parent[surface.children[::-1]] = owner[::-1]  # the last assignment stays: the first parent
+    count = np.bincount(parent[parent >= 0], minlength=len(surface))
+    keep = np.ones(len(surface), bool)
+    for internal in np.flatnonzero(~surface.leaf)[::-1]:  # children stand behind their parents
+        if count[internal]:
+            continue
+        mine = surface.children[surface.child_offset[internal]:surface.child_offset[internal + 1]]
+        spare = mine[keep[mine] & (count[parent[mine]] > 1)]
+        keep[internal] = len(spare) > 0
+        if len(spare):
+            count[parent[spare[0]]] -= 1
+            count[internal] = 1
+            parent[spare[0]] = internal
+        elif parent[internal] >= 0:
+            count[parent[internal]] -= 1
+    number = np.cumsum(keep) - 1
+    kept = {name: getattr(surface, name)[keep]
+            for name in ("centers", "radii", "normals", "coefficients", "level", "leaf", "fit_error")}
+    bare = dataclasses.replace(surface, **kept, child_offset=np.zeros(keep.sum() + 1, np.int32),
+                               children=np.zeros(0, np.int32), footprint=None, colors=None)
+    return bare, np.where(parent < 0, -1, number[parent])[keep]
 
 
 def _parents(path, column: NDArray) -> NDArray:
