@@ -123,6 +123,11 @@ def test_too_large_a_picture_is_refused_before_it_is_made(device):
         r.render(sphere(20), None, (65536, 65536))
 
 
+def test_more_than_a_buffer_may_have_is_a_clear_error(device):
+    with pytest.raises(DeviceMemoryError, match="no room"):
+        device.empty((device.largest_buffer_bytes + 4096,), np.uint8)
+
+
 def test_close(device):
     r = Renderer(device)
     r.render(sphere(20), None, (8, 8))

@@ -302,7 +302,7 @@ def test_empty_and_out_of_view(device):
             assert np.allclose(frame.color, (0.10702, 0.10702, 0.10702, 0.5), atol=1e-4)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 70), (7, 9), (257, 3), (640, 479)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 70), (7, 9), (257, 3), (3, 2000), (8192, 64), (640, 479)])
 def test_any_size(device, size):
     camera = Camera.orthographic((0, 0, 4), (0, 0, 0), height=0.5)
     with Renderer(device) as r, Renderer(device, lanes=1) as groups:

@@ -1,5 +1,6 @@
 """Choosing and opening devices."""
 
+import errno
 import logging
 import os
 import threading
@@ -19,6 +20,8 @@ from .program import Kernel, Profile, build_program, make_kernel  # noqa: E402
 log = logging.getLogger("clsurf")
 
 KINDS = {cl.device_type.GPU: "gpu", cl.device_type.CPU: "cpu", cl.device_type.ACCELERATOR: "accelerator"}
+_TOO_LARGE = (cl.status_code.INVALID_BUFFER_SIZE, cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
+              cl.status_code.OUT_OF_RESOURCES, cl.status_code.OUT_OF_HOST_MEMORY)
 # Fastest first: Intel's runtime was 2-3 times faster than PoCL 3.0 on the same processor.
 CPU_ORDER = ("intel", "pocl", "portable", "llvmpipe", "oclgrind")
 WORDS = {"pocl": ("portable", "pocl"), "intel": ("intel",), "nvidia": ("nvidia",), "amd": ("amd", "advanced micro")}
@@ -114,8 +117,11 @@ class Device:
         shape = (shape,) if np.isscalar(shape) else tuple(shape)
         try:
             return new_array(self.context, self.pool, shape, dtype)
-        except cl.MemoryError:
-            raise DeviceMemoryError(f"device {self.name}: no room for {shape} {np.dtype(dtype)}") from None
+        except (cl.Error, OSError) as error:  # OSError: the host's own pages
+            if getattr(error, "code", None) not in _TOO_LARGE and getattr(error, "errno", None) != errno.ENOMEM:
+                raise
+            raise DeviceMemoryError(f"device {self.name}: no room for {shape} {np.dtype(dtype)}: use a smaller scan or "
+                                    "picture, or another device (clsurf devices)") from None
 
     def zeros(self, shape, dtype) -> DeviceArray:
         """Return a device array of zero bytes."""

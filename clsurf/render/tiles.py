@@ -189,8 +189,9 @@ class Scratch:
         kept = self._kept.get(name)
         if kept is None or kept.nbytes < nbytes:
             self._kept.pop(name, None)
-            # An eighth more, so that a turning camera does not allocate every frame.
-            kept = self._kept[name] = self.device.empty((nbytes + nbytes // 8,), np.uint8)
+            # An eighth more, where a buffer may have it, so that a turning camera does not allocate every frame.
+            room = max(nbytes, min(nbytes + nbytes // 8, self.device.largest_buffer_bytes))
+            kept = self._kept[name] = self.device.empty((room,), np.uint8)
         host = None if kept.host is None else kept.host[:nbytes].view(dtype).reshape(shape)
         return DeviceArray(kept.buffer, shape, dtype, host)
 
