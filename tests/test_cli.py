@@ -1,7 +1,10 @@
 """The command line as a user meets it."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -39,9 +42,18 @@ def test_help(command, capsys):
 
 @pytest.mark.parametrize(("arguments", "says"), [
     (["frobnicate"], "frobnicate"), (["info", "gone.ply"], "gone.ply"), (["info"], "path"),
-    (["build", "gone.ply", "x.png"], "ends in .clsurf"), (["render", "a.ply", "b.png", "--size", "big"], "WIDTHxHEIGHT"),
+    (["build", "gone.ply", "x.png"], "ends in .clsurf"),
+    (["render", "a.ply", "b.png", "--size", "big"], "WIDTHxHEIGHT"),
     (["devices", "--no-such"], "no-such"), (["build", "a.ply", "b.clsurf", "--degree", "7"], "degree"),
     (["build", "gone.ply", "b.clsurf", "--device", "unobtainium"], ""),
+    (["render", "gone.ply", "x.gif"], "ends in .png"), (["render", "gone.ply", "no/x.png"], "no does not exist"),
+    (["render", "gone.ply", "x.png", "--channels", "colour"], "colour"), (["render", "gone.ply", "x.png", "--fov", "0"],
+                                                                         "fov"),
+    (["render", "gone.ply", "x.png", "--channels", "depth"], "color among them"),
+    (["render", "gone.ply", "x.png", "--up", "0,0,0"], "not all 0"), (["render", "gone.ply", "x.png", "--lod", "-1"],
+                                                                     "lod"),
+    (["render", "gone.ply", "x.png", "--shading", "metal"], "metal"), (["demo", "x.gif"], "ends in .png"),
+    (["build", "gone.ply", "x.clsurf", "--error", "2"], "between 0 and 1"), (["convert", "gone.ply", "x"], "ends in"),
     (["bench", "nothing"], "nothing"), (["bench", "compare", "one.json"], "two JSON files"),
 ])
 def test_a_users_mistake_is_one_line_and_exit_code_2(arguments, says, capsys, tmp_path, monkeypatch):
@@ -101,6 +113,56 @@ def test_a_closed_pipe_is_no_error():
     command = f"{sys.executable} -u -m clsurf doctor | true"
     done = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True)
     assert "Traceback" not in done.stderr and done.returncode == 0
+
+
+def test_ctrl_c_is_exit_code_130_and_leaves_nothing(tmp_path, on_device):
+    path = tmp_path / "large.npy"
+    np.save(path, np.random.default_rng(0).normal(size=(3_000_000, 3)).astype(np.float32))
+    with subprocess.Popen([sys.executable, "-m", "clsurf", "build", path, tmp_path / "large.clsurf"],
+                          stderr=subprocess.PIPE, text=True, start_new_session=True) as work:
+        try:
+            assert work.stderr.readline().startswith("load") and "3,000,000 points" in work.stderr.readline()
+            time.sleep(0.5)  # inside the build, which takes seconds
+            work.send_signal(signal.SIGINT)
+            said = work.communicate(timeout=120)[1]
+        finally:
+            work.kill()
+    assert work.returncode == 130 and said.strip().endswith("clsurf: stopped")
+    assert os.listdir(tmp_path) == ["large.npy"]
+
+
+def test_a_device_that_is_not_there(capsys, monkeypatch):
+    monkeypatch.setenv("CLSURF_DEVICE", "nonsense")
+    assert main(["devices"]) == 2
+    said = capsys.readouterr()
+    assert "lanes a work-item" in said.out or "work-group" in said.out  # what there is, is listed
+    assert "CLSURF_DEVICE=nonsense" in said.err
+    assert main(["doctor"]) == 1 and "unset CLSURF_DEVICE" in capsys.readouterr().out
+
+
+def test_no_device_at_all(monkeypatch, capsys):
+    """Without a driver: one line that says what to install; the doctor does not suggest what is installed."""
+    from clsurf.device import context, doctor
+    monkeypatch.setattr(context, "all_devices", list)
+    monkeypatch.setattr(doctor, "all_devices", list)
+    assert main(["render", __file__, "x.png"]) == 2
+    assert "pip install" in capsys.readouterr().err
+    assert main(["doctor"]) == 1
+    assert "no OpenCL device found" in capsys.readouterr().out
+
+
+def test_a_home_that_cannot_be_written_still_has_pocl(tmp_path):
+    """A file where the home should be, as root may write everywhere: PoCL's cache goes elsewhere."""
+    home = tmp_path / "file"
+    home.write_text("")
+    env = {k: v for k, v in os.environ.items() if k not in ("POCL_CACHE_DIR", "XDG_CACHE_HOME", "CLSURF_DEVICE")}
+    done = subprocess.run([sys.executable, "-m", "clsurf", "devices", "-q"], capture_output=True, text=True,
+                          env=env | {"HOME": str(home)})
+    assert done.returncode == 0 and "pthread" in done.stdout
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0 and capsys.readouterr().out == f"clsurf {clsurf.__version__}\n"
 
 
 @pytest.mark.parametrize(("text", "size"), [("640x480", (640, 480)), ("1X1", (1, 1))])

@@ -160,3 +160,33 @@ def test_garbage_is_a_clear_error(tmp_path, data, ending, cut, share):
         images.read_image(path)
     except FileFormatError as error:
         assert "\n" not in str(error)
+
+
+def test_a_cut_png_is_an_error_and_leaves_nothing(tmp_path, monkeypatch):
+    """A full disk: OpenImageIO reports success for PNG."""
+    class Cut:  # a writer that cuts the file when it closes it
+        def __init__(self, sink, name):
+            self.sink, self.name = sink, name
+
+        def __getattr__(self, name):
+            return getattr(self.sink, name)
+
+        def close(self):
+            done = self.sink.close()
+            with open(self.name, "r+b") as file:
+                file.truncate(100)
+            return done
+
+    create = images.oiio.ImageOutput.create
+    monkeypatch.setattr(images.oiio, "ImageOutput", type("Sinks", (), {"create": lambda name: Cut(create(name), name)}))
+    with pytest.raises(InputError, match="disk full"):
+        images.write_image(tmp_path / "a.png", np.random.default_rng(0).random((40, 40, 3), np.float32))
+    assert not list(tmp_path.iterdir())
+
+
+def test_jpeg_goes_through_memory(tmp_path):
+    """OpenImageIO's JPEG writer ends the process on a full disk, so it is not used."""
+    images.write_image(tmp_path / "a.jpg", np.full((5, 7, 3), 200, np.uint8))
+    assert images.read_image(tmp_path / "a.jpg").shape == (5, 7, 3)
+    with pytest.raises(InputError, match="65500"):
+        images.write_image(tmp_path / "b.jpg", np.zeros((1, 65501, 3), np.uint8))

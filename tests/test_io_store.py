@@ -230,3 +230,14 @@ def test_pai_in_the_store(tmp_path):
     assert (tmp_path / "a.clsurf").stat().st_size < 0.8 * surface.nbytes
     shutil.copy(tmp_path / "a.clsurf", tmp_path / "b.clsurf")
     assert_same(pickle.loads(pickle.dumps(again)), again)
+
+
+def test_a_place_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
+    """Not the traceback of closing a store that was never opened."""
+    import pathlib
+
+    def refuse(path, *rest, **more):
+        raise PermissionError(13, "Permission denied", str(path))
+    monkeypatch.setattr(pathlib.Path, "touch", refuse)
+    with pytest.raises(InputError, match=r"a\.clsurf: cannot be written: permission denied"):
+        save(random_surface(2, 5), tmp_path / "a.clsurf")

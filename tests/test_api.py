@@ -1,0 +1,135 @@
+"""The face of the package: README's calls as written, the public names, their docstrings and one-line texts."""
+
+import inspect
+import pickle
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clsurf
+
+CLASSES = [thing for name in clsurf.__all__ if inspect.isclass(thing := getattr(clsurf, name))]
+FUNCTIONS = [thing for name in clsurf.__all__ if inspect.isfunction(thing := getattr(clsurf, name))]
+README = Path(__file__).resolve().parents[1] / "README.md"
+
+
+@pytest.fixture(autouse=True)
+def _on_device(monkeypatch, device):
+    """Calls without device= use the device under test."""
+    monkeypatch.setenv("CLSURF_DEVICE", "intel" if "Intel" in device.platform_name else "pocl")
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """2000 points of the unit ball around a survey coordinate, with normals and colours."""
+    scan = clsurf.models.sphere(2000)
+    colors = np.full((len(scan.points), 4), 255, np.uint8)
+    return clsurf.PointCloud(scan.points + np.array([7e5, 7.6e6, 0]), normals=scan.normals, colors=colors)
+
+
+@pytest.fixture(scope="module")
+def slim(ball, device):
+    return clsurf.build_slim(ball, device=device)
+
+
+def test_the_public_names():
+    assert sorted(clsurf.__all__) == clsurf.__all__
+    assert all(hasattr(clsurf, name) for name in clsurf.__all__)
+    assert issubclass(clsurf.errors.InputError, ValueError) and issubclass(clsurf.errors.DeviceError, clsurf.Error)
+    assert re.fullmatch(r"\d+\.\d+\.\d+", clsurf.__version__)
+
+
+def test_readme_runs_as_written(ball, tmp_path, monkeypatch, device):
+    """Every line of README's Python, with a generated bunny.ply, 3 views of the 360 and the device under test."""
+    monkeypatch.chdir(tmp_path)
+    clsurf.save(ball, "bunny.ply")
+    code = re.search(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[1]
+    code = code.replace("range(360)", "range(0, 360, 120)").replace('device="intel"', "device=device")
+    names = {"device": device, "points": ball.points[:10] + ball.origin}
+    exec(code, names)
+    frame, near = names["frame"], names["near"]
+    assert frame.size == (1024, 768) and Path("bunny.png").stat().st_size > 1000
+    assert np.isnan(frame.depth[0, 0]) and np.isfinite(frame.depth[384, 512]) and frame.normal.shape == (768, 1024, 3)
+    assert near.position.dtype == np.float64 and np.abs(near.distance).max() < 0.01
+    assert len(clsurf.load("bunny.clsurf")) == len(names["slim"])
+
+
+def test_readmes_commands_exist(capsys):
+    """Every `clsurf ...` line of README's second shell block names a command and options that its help knows."""
+    from clsurf.cli import main
+    block = README.read_text(encoding="utf-8").partition("or from the shell:")[2].split("```")[1]
+    lines = re.findall(r"^clsurf (\w+)(.*?)(?:#.*)?$", block, re.M)
+    assert len(lines) >= 6
+    for command, rest in lines:
+        assert main([command, "--help"]) == 0
+        told = capsys.readouterr().out
+        assert all(option in told for option in re.findall(r"--\w+", rest)), command
+
+
+def test_a_scene_of_placed_surfaces(slim):
+    """Two surfaces in one z-buffer: `id` tells them apart, `position` + `origin` is a survey coordinate."""
+    matrix = np.eye(4)
+    matrix[0, 3] = 3.0
+    scene = clsurf.Scene([slim, slim.moved(matrix)])
+    frame = clsurf.render(scene, clsurf.Camera.framing(scene, direction=(0, 0, 1), aspect=2.0), size=(160, 80),
+                          channels=("color", "id", "position", "depth"))
+    assert set(np.unique(frame.id)) == {-1, 0, 1} and frame.id[40, 45] == 0 and frame.id[40, 115] == 1
+    center = slim.bounds.mean(axis=0) + np.where(frame.id[..., None] == 1, 3.0, 0.0) * np.array([1, 0, 0])
+    hit = frame.id >= 0
+    radius = np.linalg.norm(frame.position.astype(float) + frame.origin - center, axis=-1)[hit]
+    assert np.abs(radius - 1).max() < 0.02
+
+
+def test_a_frame_shows_itself_and_tells_its_channels(slim):
+    frame = clsurf.render(slim, size=(40, 30), channels=("color",))
+    assert frame._repr_png_().startswith(b"\x89PNG") and np.asarray(frame).shape == (30, 40, 4)
+    with pytest.raises(AttributeError, match="channels="):
+        _ = frame.depth
+    assert clsurf.render(slim, size=(1, 1)).size == (1, 1)
+
+
+def test_a_closed_renderer_says_so(slim, device):
+    with clsurf.Renderer(device=device) as renderer:
+        renderer.render(slim, size=(8, 8))
+    renderer.close()
+    with pytest.raises(clsurf.errors.DeviceError, match="closed"):
+        renderer.render(slim, size=(8, 8))
+
+
+def test_data_pickles(ball, slim):
+    for thing in (ball, slim, clsurf.models.torus(500), clsurf.render(slim, size=(8, 8)), clsurf.Camera.framing(slim)):
+        again = pickle.loads(pickle.dumps(thing))
+        assert type(again) is type(thing) and repr(again) == repr(thing)
+
+
+def test_an_empty_scene_is_all_background():
+    frame = clsurf.render(clsurf.Scene([]), size=(20, 10), channels=("color", "depth", "id"))
+    assert (frame.color == 1).all() and np.isnan(frame.depth).all() and (frame.id == -1).all()
+
+
+def test_one_line_texts(ball, slim, device):
+    camera = clsurf.Camera.framing(slim)
+    things = [ball, slim, clsurf.Mesh(np.eye(3, dtype=np.float32), [[0, 1, 2]]), camera, device, clsurf.Shading(),
+              clsurf.render(slim, camera, size=(8, 8))]
+    for thing in things:
+        text = repr(thing)
+        assert "\n" not in text and "array(" not in text and len(text) < 260, text
+
+
+@pytest.mark.parametrize("thing", CLASSES + FUNCTIONS, ids=lambda thing: thing.__name__)
+def test_docstrings(thing):
+    """A sentence everywhere; Parameters name every argument of a function; what returns says Returns."""
+    text = inspect.getdoc(thing) or ""
+    assert text.split("\n")[0].endswith((".", ":")), "one sentence first"
+    for name, member in vars(thing).items() if inspect.isclass(thing) else ():
+        if not name.startswith("_") and (inspect.isfunction(member) or isinstance(member, property | classmethod)):
+            assert inspect.getdoc(getattr(thing, name)), f"{thing.__name__}.{name}"
+    if inspect.isfunction(thing) and "`Renderer.render`" not in text:
+        assert "Parameters\n---" in text and "Raises\n---" in text
+        described = text.split("Parameters\n---")[1]
+        for name in inspect.signature(thing).parameters:
+            assert re.search(rf"\b{name}\b.* : ", described), name
+        if inspect.signature(thing).return_annotation not in (None, "None"):
+            assert "Returns\n---" in text or text.startswith("Return")
