@@ -9,8 +9,9 @@ from scipy.spatial import cKDTree
 from clsurf.build.point_tree import build_point_tree
 from clsurf.build.project import project
 from clsurf.build.radius import Noise
-from clsurf.build.slim import Points, assemble, build_levels, build_slim, check_room, parse_bytes
+from clsurf.build.slim import Points, assemble, build_levels, build_slim, check_room, face_normals, parse_bytes
 from clsurf.errors import Cancelled, DeviceMemoryError, InputError
+from clsurf.io import load, save
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 from clsurf.surface.slim import SlimSurface
@@ -335,9 +336,36 @@ def test_refuses_scans_without_extent(device, points):
         build_slim(PointCloud(points, normals=np.tile([0.0, 0, 1], (len(points), 1))), device=device)
 
 
-def test_refuses_other_things(device):
-    with pytest.raises(InputError, match="scan: expected a Mesh or a PointCloud, got str"):
-        build_slim("bunny.ply", device=device)
+def test_refuses_other_things(device, tmp_path):
+    with pytest.raises(InputError, match="scan: expected a Mesh, a PointCloud or the path of a scan, got int"):
+        build_slim(3, device=device)
+    with pytest.raises(InputError):
+        build_slim(tmp_path / "none.ply", device=device)
+    save(build_slim(cloud_of(ellipsoid, 500), device=device), tmp_path / "model.clsurf")
+    with pytest.raises(InputError, match=r"scan: expected .* got SlimSurface"):
+        build_slim(tmp_path / "model.clsurf", device=device)
+
+
+def test_builds_from_a_path(device, tmp_path):
+    scan = cloud_of(ellipsoid, 2000)
+    save(scan, tmp_path / "scan.ply")
+    plain = build_slim(load(tmp_path / "scan.ply"), device=device)
+    for path in (tmp_path / "scan.ply", str(tmp_path / "scan.ply")):
+        assert build_slim(path, device=device).coefficients.tobytes() == plain.coefficients.tobytes()
+
+
+def test_seams_have_whole_normals():
+    """A cube whose faces share no vertices: normals at its corners are those of the closed cube."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    split = np.arange(24).reshape(6, 4)
+    points = np.concatenate([corners[quads].reshape(-1, 3), [[0, 0, 0]]]).astype(np.float32)
+    normals = face_normals(points, np.concatenate([split[:, :3], split[:, [0, 2, 3]]]))
+    for corner in corners:
+        here = (points[:24] == corner).all(axis=1)
+        assert (normals[:24][here] == normals[:24][here][0]).all()
+        assert (np.sign(normals[:24][here][0]) == np.sign(corner - 0.5)).all()
+    assert (normals[24] == 0).all()  # of no face
 
 
 DEGENERATE = {

@@ -5,6 +5,7 @@ Feature Extraction, and Smoothing", SGP 2005, section 2.
 """
 
 import itertools
+import os
 import re
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,8 @@ from scipy.spatial import cKDTree
 
 from ..device import open_device
 from ..errors import Cancelled, DeviceMemoryError, InputError
+from ..io import load
+from ..io.cleaning import first_of_duplicates
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.slim import COEFFICIENTS, SlimSurface
@@ -41,9 +44,9 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
 
     Parameters
     ----------
-    scan : Mesh or PointCloud
-        Normals are taken from the scan, computed from the faces, or estimated, in this order. Points that are not
-        finite or have no normal are left out.
+    scan : Mesh, PointCloud, str or PathLike
+        A path is read with `clsurf.load`. Normals are taken from the scan, computed from the faces, or estimated, in
+        this order. Points that are not finite or have no normal are left out.
     degree : int
         Of the local polynomials: 1, 2 or 3.
     error : float or "auto"
@@ -65,7 +68,8 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
     Raises
     ------
     InputError
-        No usable point, a scan without extent, or an option out of range.
+        No usable point, a file that is missing, damaged or holds a surface instead of a scan, a scan without extent,
+        or an option out of range.
     DeviceMemoryError
         More memory needed than the limit or the device allows.
     Cancelled
@@ -75,6 +79,10 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
         raise InputError(f"degree: expected 1, 2 or 3, got {degree!r}")
     if error != "auto" and not (isinstance(error, int | float | np.number) and 0 < error < 1):
         raise InputError(f"error: expected a share of the diagonal between 0 and 1, or 'auto', got {error!r}")
+    if isinstance(scan, str | os.PathLike):
+        scan = load(scan)
+    if not isinstance(scan, Mesh | PointCloud):
+        raise InputError(f"scan: expected a Mesh, a PointCloud or the path of a scan, got {type(scan).__name__}")
     device = open_device(device)
     report = Reporter(progress)
     report("points", 0.0)
@@ -121,8 +129,6 @@ class Points:
 
 def usable_points(scan, weight, device) -> Points:
     """Return the points of `scan` that are finite and have a normal and a weight, with what belongs to them."""
-    if not isinstance(scan, Mesh | PointCloud):
-        raise InputError(f"scan: expected a Mesh or a PointCloud, got {type(scan).__name__}")
     weights = None
     if weight is not None:
         weights = np.ascontiguousarray(weight, np.float32)
@@ -199,16 +205,27 @@ def parse_bytes(value) -> int | None:
 
 
 def face_normals(points: NDArray, faces: NDArray) -> NDArray:
-    """Return vertex normals (n, 3) float32: area-weighted means over the faces, 0 for unused vertices."""
+    """Return vertex normals (n, 3) float32: area-weighted means over the faces, 0 for unused vertices.
+
+    Vertices at the same place (texture seams) share all their faces: of its own ones alone, a seam's vertex has a
+    one-sided normal, up to 43 degrees off at 511 of the 3,225 vertices of spot.obj.
+    """
     a, b, c = (points[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     scale = np.abs(cross).max()
     cross = (cross / (scale if scale > 0 else 1)).astype(np.float32)
-    rows = sparse.csr_matrix((np.ones(faces.size, np.float32), faces.ravel(), np.arange(0, faces.size + 1, 3)),
-                             shape=(len(faces), len(points)))
+    first, target = first_of_duplicates(points)
+    split = len(first) < len(points)
+    rows = sparse.csr_matrix((np.ones(faces.size, np.float32), (target[faces] if split else faces).ravel(),
+                              np.arange(0, faces.size + 1, 3)), shape=(len(faces), len(first)))
     normals = rows.T @ cross
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    if not split:
+        return normals
+    used = np.zeros(len(points), bool)
+    used[faces] = True
+    return np.where(used[:, None], normals[target], np.float32(0))
 
 
 @dataclass
