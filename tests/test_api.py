@@ -59,7 +59,7 @@ def test_readme_runs_as_written(ball, tmp_path, monkeypatch, device):
 def test_readmes_commands_exist(capsys):
     """Every `clsurf ...` line of README's second shell block names a command and options that its help knows."""
     from clsurf.cli import main
-    block = README.read_text(encoding="utf-8").partition("or from the shell:")[2].split("```")[1]
+    block = README.read_text(encoding="utf-8").partition("or from the shell")[2].split("```")[1]
     lines = re.findall(r"^clsurf (\w+)(.*?)(?:#.*)?$", block, re.M)
     assert len(lines) >= 6
     for command, rest in lines:
@@ -111,7 +111,8 @@ def test_an_empty_scene_is_all_background():
 
 def test_one_line_texts(ball, slim, device):
     camera = clsurf.Camera.framing(slim)
-    things = [ball, slim, clsurf.Mesh(np.eye(3, dtype=np.float32), [[0, 1, 2]]), camera, device, clsurf.Shading(),
+    mesh = clsurf.Mesh(np.eye(3, dtype=np.float32), [[0, 1, 2]])
+    things = [ball, mesh, slim, slim.moved(np.eye(4)), camera, device, clsurf.Shading(), clsurf.Profile(),
               clsurf.render(slim, camera, size=(8, 8))]
     for thing in things:
         text = repr(thing)

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +38,11 @@ def examine() -> list[Finding]:
     return findings
 
 
+def _pip(what: str) -> str:
+    """Return the command that installs `what` where clsurf runs: a bare pip may be another Python's."""
+    return f"{shlex.quote(sys.executable)} -m pip install {what}"
+
+
 def _python() -> Finding:
     version = ".".join(map(str, sys.version_info[:3]))
     good = sys.version_info >= (3, 11)
@@ -47,7 +53,7 @@ def _kernels() -> Finding:
     try:
         folder = kernel_folder()
     except Error as error:
-        return Finding("kernels", False, str(error), "pip install --force-reinstall clsurf")
+        return Finding("kernels", False, str(error), _pip("--force-reinstall clsurf"))
     return Finding("kernels", True, f"{len(list(folder.rglob('*.cl')))} files in {folder}")
 
 
@@ -68,12 +74,12 @@ def _drivers() -> list[Finding]:
     linux = sys.platform.startswith("linux")
     if linux and intel is None:
         findings.append(Finding("Intel CPU runtime", True, "not installed (optional; two to three times faster than "
-                                "PoCL on the same processor)", "pip install 'clsurf[intel]'"))
+                                "PoCL on the same processor)", _pip("'clsurf[intel]'")))
     elif intel is not None:
         missing = [name for name in icd.INTEL_NEEDS if not (intel.parent / name).exists()]
         lack = f", lacks {missing}" if missing else ""
         findings.append(Finding("Intel CPU runtime", not missing, f"{intel}{lack}",
-                                "pip install intel-cmplr-lib-rt" if missing else ""))
+                                _pip("intel-cmplr-lib-rt") if missing else ""))
     if icd.nvidia_library():
         findings.append(Finding("NVIDIA driver", True, icd.nvidia_library()))
     return findings
@@ -84,11 +90,11 @@ def _no_device(writable_cache: bool) -> Finding:
     try:
         version = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        return Finding("device", False, "no OpenCL device found", f"pip install {name}")
+        return Finding("device", False, "no OpenCL device found", _pip(name))
     detail = f"no OpenCL device found, though {name} {version} is installed"
     if not writable_cache:
         return Finding("device", False, f"{detail}: PoCL cannot write its cache", "unset POCL_CACHE_DIR")
-    return Finding("device", False, detail, f"pip install --force-reinstall {name}")
+    return Finding("device", False, detail, _pip(f"--force-reinstall {name}"))
 
 
 def _choice() -> list[Finding]:
@@ -108,7 +114,7 @@ def _device(cl_device) -> Finding:
         check(device)
     except Error as error:
         lines = [line for line in str(error).splitlines() if line.strip()]
-        mend = "pip install 'clsurf[intel]'" if "Portable" in cl_device.platform.name else "update its driver"
+        mend = _pip("'clsurf[intel]'") if "Portable" in cl_device.platform.name else "update its driver"
         return Finding(label, False, " ".join(lines)[:300], mend)
     return Finding(label, True, f"{device.kind}, {device.units} units, {device.memory_bytes / 1e9:.1f} GB, "
                    f"{device.version}, driver {device.driver}: compiles and computes")
@@ -135,4 +141,4 @@ def _package(name: str, use: str) -> Finding:
     try:
         return Finding(name, True, f"{importlib.metadata.version(name)} ({use})")
     except importlib.metadata.PackageNotFoundError:
-        return Finding(name, False, f"not installed ({use})", f"pip install {name}")
+        return Finding(name, False, f"not installed ({use})", _pip(name))

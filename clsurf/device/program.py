@@ -69,6 +69,9 @@ class Profile:
                 for label, s in self.seconds.items()]
         return sorted(rows, key=lambda row: -row[4])
 
+    def __repr__(self):
+        return f"Profile({len(self.seconds)} kernels, {1e3 * sum(map(sum, self.seconds.values())):.3f} ms)"
+
     def __str__(self):
         lines = [f"{'kernel or stage':28} {'calls':>6} {'min ms':>9} {'median ms':>10} {'share':>7}"]
         lines += [f"{label:28} {calls:6d} {low:9.3f} {median:10.3f} {share:6.1%}"

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Placed:
     """A surface moved by a similarity; its arrays are shared with the original.
 
@@ -38,6 +38,10 @@ class Placed:
     def nbytes(self) -> int:
         """Bytes of the shared surface and the matrix."""
         return self.surface.nbytes + self.matrix.nbytes
+
+    def __repr__(self):
+        shift = np.round(self.matrix[:3, 3], 4).tolist()
+        return f"Placed({self.surface!r}, scaled by {self.scale:.6g}, moved by {shift})"
 
     def moved(self, matrix) -> "Placed":
         """Return the surface moved further by `matrix` (4, 4)."""
