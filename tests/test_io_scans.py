@@ -541,3 +541,10 @@ def test_draco_without_its_decoder(tmp_path, monkeypatch):
     for name in ("a.glb", "b.gltf"):
         with pytest.raises(FileFormatError, match="pip install DracoPy"):
             load(tmp_path / name)
+
+
+def test_stl_says_what_it_rounds(tmp_path, caplog):
+    save(make_mesh(), tmp_path / "near.stl")
+    assert not caplog.records
+    save(make_mesh(origin=SURVEY), tmp_path / "far.stl")
+    assert "rounded by up to 0.25" in caplog.text

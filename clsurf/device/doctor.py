@@ -73,8 +73,8 @@ def _drivers() -> list[Finding]:
     intel = icd.intel_library()
     linux = sys.platform.startswith("linux")
     if linux and intel is None:
-        findings.append(Finding("Intel CPU runtime", True, "not installed (optional; two to three times faster than "
-                                "PoCL on the same processor)", _pip("'clsurf[intel]'")))
+        findings.append(Finding("Intel CPU runtime", True, "not installed (optional: a second CPU driver)",
+                                _pip("'clsurf[intel]'")))
     elif intel is not None:
         missing = [name for name in icd.INTEL_NEEDS if not (intel.parent / name).exists()]
         lack = f", lacks {missing}" if missing else ""

@@ -5,6 +5,8 @@ import logging
 import warnings
 from pathlib import Path
 
+import numpy as np
+
 from clsurf.errors import Error, FileFormatError, InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
@@ -64,8 +66,8 @@ def save_scan(scan: Mesh | PointCloud, path) -> None:
     """Write a scan in the format of `path`'s ending; the file appears whole or not at all.
 
     World positions are written. What a format cannot hold (colours in STL, say) is left out and named in one log line;
-    STL is float32, so a survey coordinate loses millimetres there. OBJ with a texture also writes NAME.mtl and
-    NAME.png.
+    STL is float32: a survey coordinate of 7,691,239.553 is rounded to the half metre there, which is said too. OBJ with
+    a texture also writes NAME.mtl and NAME.png.
 
     Parameters
     ----------
@@ -90,6 +92,11 @@ def save_scan(scan: Mesh | PointCloud, path) -> None:
         writer(scan, temporary)
     if lost:
         log.info("%s: %s cannot hold %s", Path(path).name, ending, ", ".join(lost))
+    if ending == ".stl":
+        step = float(np.spacing(np.float32(np.abs(scan.bounds).max())))
+        if step > 1e-5 * np.ptp(scan.bounds, axis=0).max():
+            log.warning("%s: .stl is float32: positions are rounded by up to %.3g, write .ply or .obj", Path(path).name,
+                        step / 2)
 
 
 def _has(scan, name: str) -> bool:
