@@ -66,6 +66,19 @@ def test_the_cut_covers_and_is_coarser_far_away(device):
     assert counts[1] >= counts[2] >= counts[3] >= counts[4] and counts[4] <= 60
 
 
+def test_inaccurate_surfels_count_as_large(device):
+    """At 100 px every internal surfel is small enough; an error of 1/64 of that, in pixels, still refines them."""
+    camera, size = Camera.look_at((0, 0, 30), (0, 0, 0)), (200, 200)
+    pixel = 29 / camera.projection(size).fy  # world units, at the sphere's front
+    for error, leaves_alone in ((0.0, False), (1.4 * pixel, False), (1.9 * pixel, True)):
+        surface = two_level_sphere(error=error)
+        _, _, view, _, _, footprints = staged(device, surface, camera, size, 100.0)
+        full = device.download(footprints.full)
+        shown = full[:, 0] <= full[:, 2]
+        assert (shown <= twin.drawn(view, surface)).all()  # a thin piece may lie between the pixels
+        assert shown[surface.leaf].any() == leaves_alone and shown[~surface.leaf].any() != leaves_alone
+
+
 def test_three_levels_with_shared_children(device):
     # 0 and 1 are roots with the common child 3; 2 is a small internal root; 3 has the leaf 4; 5 is a lonely leaf.
     k = np.zeros((6, 6))

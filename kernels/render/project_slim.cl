@@ -14,6 +14,9 @@
 #ifndef BALLS
 #define BALLS 0  // 1: bound the balls themselves, at their own size, for tile_balls
 #endif
+#ifndef INTERNAL_SCALE
+#define INTERNAL_SCALE 1.5f  // radius that internal surfels are drawn with over their own
+#endif
 #ifndef BACK_BIAS
 #define BACK_BIAS 0.25f  // radii that a hit from behind is set back by
 #endif
@@ -74,7 +77,12 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   float scale = view[SCALE];
   VF X = scale * (view[0] * x + view[1] * y + view[2] * z) + view[OFFSET];
   VF Y = scale * (view[3] * x + view[4] * y + view[5] * z) + view[OFFSET + 1];
-  VF r = scale * plane[(BALLS ? SIZE_RADIUS : BALL_RADIUS) * step], inv_r = 1.0f / r;
+  VF r = scale * plane[BALL_RADIUS * step];
+#if BALLS
+  for (int i = 0; i < lanes; i++)
+    if (!(flags[first + i] & IS_LEAF)) ((float *)&r)[i] *= 1.0f / INTERNAL_SCALE;
+#endif
+  VF inv_r = 1.0f / r;
   // The frame of the stored normal (common/frame.clh in lanes), turned into view space.
   VF nx = plane[NORMAL * step], ny = plane[(NORMAL + 1) * step], nz = plane[(NORMAL + 2) * step];
   VF sign = SEL((VF)(1.0f), (VF)(-1.0f), AS_VI(nz) < 0);

@@ -10,7 +10,7 @@ import numpy as np
 
 from clsurf.surface.slim import frame_of_normals
 
-ALPHA, SUPPORT, TRIES, BACK_BIAS, INTERNAL_SCALE = 0.8, 0.3, 4, 0.25, 1.5
+ALPHA, SUPPORT, TRIES, BACK_BIAS, INTERNAL_SCALE, ERROR_RADII = 0.8, 0.3, 4, 0.25, 1.5, 32
 BUCKETS = 2048
 (XR, YR, T_REF, INV_T, UX, UY, VX, VY, WX, WY, U0, V0, W0, DU, DV, DW, K0, K1, K2, K3, K4, K5, RADIUS, RADIUS_PX,
  FOOT_LO, FOOT_HI, BIAS, REACH, K6, K7, K8, K9) = range(32)
@@ -31,7 +31,8 @@ def in_view(view, points):
 def is_small(view, surface):
     v = opened(view)
     depth = -in_view(view, surface.centers)[:, 2] if v.perspective else 1.0
-    return 2 * v.scale * max(v.fx, v.fy) * surface.radii <= v.lod * depth
+    size = np.where(surface.leaf, surface.radii, np.maximum(surface.radii, ERROR_RADII * surface.fit_error))
+    return 2 * v.scale * max(v.fx, v.fy) * size <= v.lod * depth
 
 
 def select_slim(view, surface):

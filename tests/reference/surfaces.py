@@ -72,7 +72,7 @@ def sphere(n=400, radius=1.0, reach=1.6, **more):
     return leaves(points, np.full(n, reach * spacing), normals, k, 2, **more)
 
 
-def two_level_sphere(coarse=60, fine=600, radius=1.0):
+def two_level_sphere(coarse=60, fine=600, radius=1.0, error=0.0):
     """Internal surfels of level 1, each the parent of the leaves of level 2 inside its ball; most have two parents."""
     top, bottom = sphere(coarse, radius, 1.2), sphere(fine, radius, 1.6)
     inside = cKDTree(bottom.centers).query_ball_point(top.centers, top.radii[0])
@@ -83,7 +83,8 @@ def two_level_sphere(coarse=60, fine=600, radius=1.0):
     return SlimSurface(degree=2, error=0.01, **join, level=np.repeat([1, 2], [coarse, fine]),
                        leaf=np.arange(n) >= coarse,
                        child_offset=np.concatenate([[0], np.cumsum(counts), np.full(fine, sum(counts))]),
-                       children=coarse + np.concatenate([np.sort(i) for i in inside]), fit_error=np.zeros(n))
+                       children=coarse + np.concatenate([np.sort(i) for i in inside]),
+                       fit_error=np.where(np.arange(n) < coarse, error, 0))
 
 
 def reordered(surface, order):
