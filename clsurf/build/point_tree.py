@@ -100,12 +100,15 @@ def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: 
     order, codes, grid = morton_order(points, device)
     padded = -(-count // BLOCK) * BLOCK
     out = device.empty((6 if weights is None else 7, padded), np.float32)
-    device.kernel("build/gather_points.cl")((padded,), (64,), count, padded, device.upload(points),
-                                           device.upload(normals), device.upload(order), *map(float, middle),
-                                           float(scale), out)
+    on_device = device.upload(order)
+    gather = device.kernel("build/gather_points.cl")
+    for is_normal, vectors in enumerate((points, normals)):  # one after the other: 12 bytes a point less at the peak
+        gather((padded,), (64,), count, padded, is_normal, device.upload(vectors), on_device, *map(float, middle),
+               float(scale), out)
+        device.finish()
     if weights is not None:
         device.kernel("build/gather_weights.cl")((padded,), (64,), count, padded, device.upload(weights),
-                                                device.upload(order), out)
+                                                on_device, out)
     boxes, node_offset, top_level = build_boxes(out, padded, device)
     return PointTree(device, count, padded, order, codes, grid[0], out, boxes, node_offset, top_level,
                      grid[1] / scale)

@@ -1,31 +1,35 @@
-// Points (n, 3) in sorted order, as six arrays: unit-diagonal coordinates and unit normals, padded to whole blocks.
+// Vectors (n, 3) in sorted order, as three arrays padded to whole blocks: unit-diagonal coordinates, or unit normals.
+//
+// Two launches, so that the host's copies of points and normals can take turns in one block of memory.
 #ifndef FAR_POINT
 #define FAR_POINT 1e6f // finite: a masked lane must not meet inf * 0
 #endif
 
-__kernel void gather_points(int count, int padded, __global const float *points, __global const float *normals,
+__kernel void gather_points(int count, int padded, int normals, __global const float *vectors,
                             __global const int *order, float mid_x, float mid_y, float mid_z, float scale,
                             __global float *sorted) {
   int i = get_global_id(0);
   if (i >= padded) return;
-  float x = FAR_POINT, y = FAR_POINT, z = FAR_POINT, nx = 0.0f, ny = 0.0f, nz = 1.0f;
+  float far = normals ? 0.0f : FAR_POINT, x = far, y = far, z = normals ? 1.0f : far;
   if (i < count) {
     size_t j = 3 * (size_t)order[i];
-    x = (points[j] - mid_x) * scale;
-    y = (points[j + 1] - mid_y) * scale;
-    z = (points[j + 2] - mid_z) * scale;
-    nx = normals[j];
-    ny = normals[j + 1];
-    nz = normals[j + 2];
-    float k = 1.0f / sqrt(nx * nx + ny * ny + nz * nz);
-    nx *= k;
-    ny *= k;
-    nz *= k;
+    x = vectors[j];
+    y = vectors[j + 1];
+    z = vectors[j + 2];
+    float k = scale;
+    if (normals) {
+      k = 1.0f / sqrt(x * x + y * y + z * z);
+    } else {
+      x -= mid_x;
+      y -= mid_y;
+      z -= mid_z;
+    }
+    x *= k;
+    y *= k;
+    z *= k;
   }
-  sorted[i] = x;
-  sorted[padded + (size_t)i] = y;
-  sorted[2 * (size_t)padded + i] = z;
-  sorted[3 * (size_t)padded + i] = nx;
-  sorted[4 * (size_t)padded + i] = ny;
-  sorted[5 * (size_t)padded + i] = nz;
+  size_t first = normals ? 3 * (size_t)padded : 0;
+  sorted[first + i] = x;
+  sorted[first + padded + i] = y;
+  sorted[first + 2 * (size_t)padded + i] = z;
 }
