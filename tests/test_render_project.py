@@ -79,6 +79,21 @@ def test_inaccurate_surfels_count_as_large(device):
         assert shown[surface.leaf].any() == leaves_alone and shown[~surface.leaf].any() != leaves_alone
 
 
+@pytest.mark.parametrize("lanes", LANES)
+@pytest.mark.parametrize("balls", (False, True))
+def test_balls_have_their_own_size(device, lanes, balls):
+    """Pictures of the balls show internal surfels at their own radius, others at the larger one that closes gaps."""
+    surface = two_level_sphere()
+    camera = Camera.look_at((0, 0, 30), (0, 0, 0))
+    _, _, _, _, records, footprints = staged(device, surface, camera, (200, 200), 100.0, lanes, balls)
+    full = device.download(footprints.full)
+    shown = full[:, 0] <= full[:, 2]
+    assert shown[~surface.leaf].any()
+    scale = np.where(surface.leaf | balls, 1, twin.INTERNAL_SCALE)
+    got = device.download(records)[shown, twin.RADIUS]
+    np.testing.assert_allclose(got, (surface.radii * scale)[shown], rtol=1e-6)
+
+
 def test_three_levels_with_shared_children(device):
     # 0 and 1 are roots with the common child 3; 2 is a small internal root; 3 has the leaf 4; 5 is a lonely leaf.
     k = np.zeros((6, 6))
