@@ -79,12 +79,12 @@ def test_tile_slim(device, torus, which):
     same = hit == np.isfinite(wanted.depth)
     both = hit & np.isfinite(wanted.depth)
     close = np.abs(got.depth.ravel() - wanted.depth)[both] < 2e-5
-    # Two tiers: float32 flips single pixels at silhouettes; everything else is tight.
-    assert same.mean() > 0.99 and close.mean() > 0.99
+    # Two tiers: float32 may flip single pixels at silhouettes (measured: none of 1540, PoCL and Intel); else tight.
+    assert same.mean() > 0.998 and close.mean() > 0.998
     normal = wanted.gradient / np.linalg.norm(wanted.gradient, axis=1, keepdims=True) @ camera.rotation
     turned = np.abs(got.normal.reshape(-1, 3) - normal)[both].max(axis=1)
-    assert (turned < 1e-3).mean() > 0.99
-    assert (got.count.ravel()[both] == wanted.count[both]).mean() > 0.99
+    assert (turned < 1e-3).mean() > 0.998
+    assert (got.count.ravel()[both] == wanted.count[both]).mean() > 0.998
     assert (got.count.ravel()[~hit] == -1).all() and (got.level.ravel()[hit] == 1).all()
     position = got.position.reshape(-1, 3)[hit] + got.origin
     assert np.abs((position - camera.eye) @ -camera.rotation[2] - got.depth.ravel()[hit]).max() < 1e-5
