@@ -10,7 +10,8 @@
 #define TAKEN 1
 #define CENTER 2
 
-__kernel void choose_centers(int cells, int first, __global const int *cell_start, __global const int *cell_end, float spacing,
+__kernel void choose_centers(int cells, int first, __global const int *cell_start, __global const int *cell_end,
+                             float spacing,
                              int padded, __global const float *sorted, __global const float *boxes,
                              __global const int *node_offset, int top_level, __global uchar *state) {
   int cell = get_global_id(0);

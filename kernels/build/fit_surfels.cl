@@ -18,11 +18,11 @@
 #define CUBIC_LIMIT 1.0f       // |c r^2| of a cubic term; beyond it the cubic terms of a lane are dropped
 #define NORMAL_SHARE 0.618034f // of the radius: the ball whose mean normal sets the frame
 // A true minimum of E has e^2 = lambda (T/r)^2 / (degree + 1), above the noise; e^2 far above it is a plateau: detail
-// smoothed away between two scales (the demo's flutes and rosettes: 12 leaves of 16K, e^2 up to 2000 times the penalty).
+// smoothed away between scales (the demo's flutes and rosettes: 12 leaves of 16K, e^2 up to 2000 times the penalty).
 #define PLATEAU 4.0f
 #define NOISE_ALLOWED 3.0f // lambdas of e^2; lambda is about 0.7 of the noise's variance
-// Points whose normals have a smaller cosine with the centre's are of the sheet behind. Right angles stay in: taken
-// apart from 0.3 on, a cube-like edge (fandisk) lets large leaves stand out over it, RMS 0.07 to 0.46 % of the diagonal.
+// Points whose normals have a smaller cosine with the centre's are of the sheet behind. Right angles stay in: without
+// those below 0.3, large leaves stand out over the edges of fandisk, RMS 0.07 to 0.46 % of the diagonal.
 #define OTHER_SHEET -0.2f
 #define SPARSE 6.0f    // point spacings: a quarter of a disc of that radius has more points than a quadratic needs
 #define COMPANY 5      // points of a wide ball; fewer is alone
@@ -180,7 +180,7 @@ inline float fit_all_points(int padded, __global const float *sorted, __global c
 }
 
 #if DEGREE == 1
-// The frame turns to the fitted plane; c[0] becomes the plane's distance, the slopes vanish. Returns the cosine squared.
+// The frame turns to the fitted plane; c[0] becomes its distance, the slopes vanish. Returns the cosine squared.
 inline float turn_to_plane(const Frame *f, VF *normal, VF *c) {
   VF k = 1.0f / VSQRT(1.0f + c[1] * c[1] + c[2] * c[2]);
   normal[0] = (f->nx - c[1] * f->ux - c[2] * f->vx) * k;

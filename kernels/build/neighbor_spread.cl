@@ -87,5 +87,6 @@ __kernel void neighbor_spread(int queries, __global const int *block, int padded
   union { VI v; int s[16]; } is_real;
   is_real.v = real;
   for (int j = 0; j < 16; ++j)
-    spread[16 * (size_t)q + j] = is_real.s[j] ? smallest_eigenvalue(cxx.s[j], cyy.s[j], czz.s[j], cxy.s[j], cxz.s[j], cyz.s[j]) : -1.0f;
+    spread[16 * (size_t)q + j] =
+        is_real.s[j] ? smallest_eigenvalue(cxx.s[j], cyy.s[j], czz.s[j], cxy.s[j], cxz.s[j], cyz.s[j]) : -1.0f;
 }
