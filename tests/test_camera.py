@@ -82,6 +82,8 @@ def test_orbit_keeps_the_distance_and_the_target():
     lambda: Camera.look_at((0, 0, 1), (0, 0, 0), fov=180), lambda: Camera.orthographic((0, 0, 1), (0, 0, 0), height=0),
     lambda: Camera.framing(np.full((2, 3), np.nan)), lambda: Camera((0, 0, 0), np.eye(3)),
     lambda: Camera((0, 0, 0), np.diag([1, 1, -1.0]), fov=40),
+    lambda: Camera.framing(BOX, fov=0), lambda: Camera.framing(BOX, aspect=0),
+    lambda: Camera.framing(BOX, up=(0, 0, 0)),
     lambda: Camera.from_intrinsics(np.diag([1.0, 0, 1]), np.eye(4), (4, 4)),
     lambda: Camera.from_intrinsics(np.array([[1.0, 1, 0], [0, 1, 0], [0, 0, 1]]), np.eye(4), (4, 4)),
 ])

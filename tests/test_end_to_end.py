@@ -84,3 +84,26 @@ def test_stored_surfaces_draw_the_same_picture(device, tmp_path):
         frame = clsurf.render(clsurf.load(tmp_path / name), camera, SIZE, device=device)
         same = np.isclose(frame.depth, wanted.depth, rtol=1e-4, equal_nan=True)
         assert same.mean() >= share, name
+
+
+def test_a_scene_is_framed_like_its_surface(device):
+    """Without a camera the picture is as full as one framed by hand; moved surfaces are seen whole."""
+    surface = clsurf.build_slim(scenes.wavy_torus(200, 80), device=device)
+    framed = clsurf.render(surface, clsurf.Camera.framing(surface), SIZE, channels="depth", device=device)
+    alone = clsurf.render(surface, None, SIZE, channels="depth", device=device)
+    np.testing.assert_array_equal(alone.depth, framed.depth)
+    away = np.eye(4)
+    away[0, 3] = 5
+    pair = clsurf.render([surface, surface.moved(away)], None, SIZE, channels=("depth", "id"), device=device)
+    seen = np.isfinite(pair.depth)
+    assert not (seen[0].any() or seen[-1].any() or seen[:, 0].any() or seen[:, -1].any())
+    assert set(np.unique(pair.id)) == {-1, 0, 1}
+
+
+@pytest.mark.parametrize("options", [{"camera": 3}, {"shading": 3}, {"lod": "x"}, {"lod": -1}, {"channels": "colour"}])
+def test_wrong_options_of_render_are_named(device, options):
+    surface = clsurf.build_slim(scenes.wavy_torus(60, 30), device=device)
+    with pytest.raises(clsurf.Error, match="expected"):
+        clsurf.render(surface, **{"camera": None, "size": (16, 16), "device": device} | options)
+    with pytest.raises(clsurf.Error, match="expected a list"):
+        clsurf.Scene(surface)

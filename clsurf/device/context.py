@@ -22,7 +22,7 @@ log = logging.getLogger("clsurf")
 KINDS = {cl.device_type.GPU: "gpu", cl.device_type.CPU: "cpu", cl.device_type.ACCELERATOR: "accelerator"}
 _TOO_LARGE = (cl.status_code.INVALID_BUFFER_SIZE, cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
               cl.status_code.OUT_OF_RESOURCES, cl.status_code.OUT_OF_HOST_MEMORY)
-# Fastest first: Intel's runtime was 2-3 times faster than PoCL 3.0 on the same processor.
+# Fastest first: a dragon frame took 9.4 ms on Intel's runtime and 10.3 on PoCL 3.0, its build 0.21 and 0.25 s.
 CPU_ORDER = ("intel", "pocl", "portable", "llvmpipe", "oclgrind")
 WORDS = {"pocl": ("portable", "pocl"), "intel": ("intel",), "nvidia": ("nvidia",), "amd": ("amd", "advanced micro")}
 

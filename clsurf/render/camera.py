@@ -146,6 +146,9 @@ class Camera:
         InputError
             `thing` has no finite extent (an empty scan).
         """
+        if not 0 < fov < 180 or not 0 < aspect < np.inf or not 0 < margin < np.inf:
+            raise InputError("camera framing: expected fov between 0 and 180 degrees, a positive aspect and margin, "
+                             f"got {fov}, {aspect}, {margin}")
         box = np.asarray(getattr(thing, "bounds", thing), np.float64)
         if box.shape != (2, 3) or not np.isfinite(box).all():
             raise InputError("camera framing: expected something with a finite bounding box, got an empty one")
@@ -225,6 +228,13 @@ def _fitting_distance(view, shift, reach, tan) -> float:
 
 def _extent(thing, box) -> tuple[NDArray, NDArray | float]:
     """Return positions (n, 3) float64, world space, and the radii around them that a picture of `thing` must hold."""
+    placed = getattr(thing, "placed", None)
+    if placed is not None:  # a scene: unmoved surfaces by themselves, moved ones by their boxes
+        parts = [_extent(surface, surface.bounds) if matrix is None else _extent(None, whole.bounds)
+                 for (surface, matrix), whole in zip(placed, thing.surfaces, strict=True)
+                 if np.isfinite(whole.bounds).all()]
+        reach = [np.broadcast_to(np.asarray(r, np.float64), len(p)) for p, r in parts]
+        return np.concatenate([p for p, _ in parts]), np.concatenate(reach)
     if hasattr(thing, "centers") and len(thing.centers):
         leaf = thing.leaf if thing.leaf.any() else np.ones(len(thing.centers), bool)
         flat = np.sqrt(np.clip(1 - thing.normals[leaf].astype(np.float64) ** 2, 0, 1)).max(axis=1)
@@ -238,7 +248,8 @@ def _looking(forward, up) -> NDArray:
     """Return the world-to-view rotation of a camera that looks along `forward` with `up` above."""
     forward, up = np.asarray(forward, np.float64), np.asarray(up, np.float64)
     length = np.linalg.norm(forward)
-    if forward.shape != (3,) or up.shape != (3,) or not np.isfinite(length) or length == 0:
+    if forward.shape != (3,) or up.shape != (3,) or not np.isfinite(length) or length == 0 \
+            or not 0 < np.linalg.norm(up) < np.inf:
         raise InputError("camera: expected an eye, target (or direction) and up of 3 finite numbers each, eye and "
                          "target apart")
     back = -forward / length

@@ -87,7 +87,11 @@ class Renderer:
             raise DeviceError("renderer: it is closed: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
         shading = Shading() if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
+        if not isinstance(shading, Shading):
+            raise InputError(f"shading: expected a clsurf.Shading or the name of a look, got {shading!r}")
         camera = self._framing(scene, size) if camera is None else camera
+        if not isinstance(camera, Camera):
+            raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
         own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
         try:
             # The stages of a frame.
@@ -102,10 +106,8 @@ class Renderer:
             self.device.profile = own_profile
 
     def _framing(self, scene, size) -> Camera:
-        box = scene.bounds
-        if not np.isfinite(box).all():
-            box = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-        return Camera.framing(box, aspect=size[0] / size[1])
+        thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        return Camera.framing(thing, aspect=size[0] / size[1])
 
     def _new_grid(self, scene, size, channels, shading) -> Grid:
         """Return bins that nothing has touched yet."""
@@ -180,8 +182,8 @@ def checked_channels(channels) -> tuple[str, ...]:
 
 def checked_lod(lod) -> float:
     """Return the level-of-detail threshold in pixels, or raise InputError."""
-    if not np.isscalar(lod) or not 0 <= lod < np.inf:
-        raise InputError(f"lod: expected a projected diameter in pixels of at least 0, got {lod}")
+    if not isinstance(lod, int | float | np.number) or not 0 <= lod < np.inf:
+        raise InputError(f"lod: expected a projected diameter in pixels of at least 0, got {lod!r}")
     return float(lod)
 
 

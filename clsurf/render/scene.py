@@ -34,6 +34,8 @@ class Scene:
     lights: tuple[Light, ...] = (Light(),)
 
     def __post_init__(self):
+        if not isinstance(self.surfaces, list | tuple):
+            raise InputError(f"scene: expected a list of surfaces, got a {type(self.surfaces).__name__}")
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
         object.__setattr__(self, "lights", tuple(self.lights))
         for i, surface in enumerate(self.surfaces):
