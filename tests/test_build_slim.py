@@ -429,9 +429,7 @@ def test_progress_rises_and_cancels(device):
 
 
 def test_bunny(device):
-    trimesh = pytest.importorskip("trimesh")
-    mesh = trimesh.load(scan_path("bunny/bunny.obj"), process=False)
-    scan = Mesh(mesh.vertices, mesh.faces)
+    scan = load(scan_path("bunny/bunny.obj"))
     surface = build_slim(scan, device=device)
     assert 5500 < surface.leaf.sum() < 7000
     assert isinstance(surface, SlimSurface)

@@ -146,7 +146,7 @@ def test_failed_write_keeps_the_old_picture(tmp_path):
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
-@settings(max_examples=60, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=20000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.binary(min_size=1, max_size=300), ending=st.sampled_from([".png", ".jpg", ".exr"]), cut=st.booleans(),
        share=st.floats(0, 0.99))
 def test_garbage_is_a_clear_error(tmp_path, data, ending, cut, share):

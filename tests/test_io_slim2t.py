@@ -154,7 +154,7 @@ def test_nothing_to_write(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@settings(max_examples=150, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, deadline=20000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.one_of(
     st.binary(min_size=1, max_size=200),
     st.tuples(st.integers(-4, 4), st.integers(-5, 2**31 - 1), st.integers(-5, 2**31 - 1), st.binary(max_size=300)).map(

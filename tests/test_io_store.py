@@ -195,7 +195,7 @@ def test_foreign_files(tmp_path):
         save(random_surface(2), tmp_path / "a.ply")
 
 
-@settings(max_examples=120, deadline=3000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=120, deadline=20000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_bytes_cut_and_flipped(tmp_path, data):
     path = tmp_path / "whole.clsurf"
