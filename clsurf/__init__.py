@@ -5,6 +5,7 @@ The public names on one screen; every other name is private to the package.
 
 from . import errors, models
 from .build.normals import estimate_normals
+from .build.patches import build_patches
 from .build.project import Projection, project
 from .build.slim import build_slim
 from .device import Device, Profile, open_device
@@ -17,13 +18,14 @@ from .render.scene import Scene
 from .render.shade import Shading
 from .surface.cloud import PointCloud
 from .surface.mesh import Mesh
+from .surface.patch import PatchSurface
 from .surface.placed import Placed
 from .surface.slim import SlimSurface
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Device", "Error", "Frame", "Mesh", "Placed", "PointCloud", "Profile", "Projection", "Renderer", "Scene",
-    "Shading", "SlimSurface", "build_slim", "errors", "estimate_normals", "load", "models", "open_device", "project",
-    "render", "save",
+    "Camera", "Device", "Error", "Frame", "Mesh", "PatchSurface", "Placed", "PointCloud", "Profile", "Projection",
+    "Renderer", "Scene", "Shading", "SlimSurface", "build_patches", "build_slim", "errors", "estimate_normals", "load",
+    "models", "open_device", "project", "render", "save",
 ]

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
+from clsurf.surface.patch import PatchSurface
 from clsurf.surface.slim import SlimSurface
 
-KINDS = {"slim": SlimSurface, "mesh": Mesh, "points": PointCloud}
+KINDS = {"slim": SlimSurface, "patches": PatchSurface, "mesh": Mesh, "points": PointCloud}
 
 
 def to_arrays(thing) -> tuple[str, dict[str, NDArray], dict[str, Any]]:
@@ -89,7 +90,18 @@ def _unpack_slim(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
     return arrays
 
 
-_PACKING = {"slim": (_pack_slim, _unpack_slim)}
+def _pack_patches(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Store one size where all patches have the same."""
+    size = arrays["size"]
+    return arrays | {"size": size[:1] if len(size) and (size == size[0]).all() else size}
+
+
+def _unpack_patches(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
+    size, count = arrays["size"], len(arrays["origins"])
+    return arrays | {"size": size[0] if len(size) == 1 and count > 1 else size}
+
+
+_PACKING = {"slim": (_pack_slim, _unpack_slim), "patches": (_pack_patches, _unpack_patches)}
 
 
 def pack_normals(normals) -> tuple[NDArray, NDArray]:
