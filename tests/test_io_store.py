@@ -150,7 +150,7 @@ def json_edit(change):
 @pytest.mark.parametrize("edits, message", [
     ({"zarr.json": json_edit(lambda t: t["attributes"].update(version=2))}, "version 2"),
     ({"zarr.json": json_edit(lambda t: t["attributes"].update(version="x"))}, "version"),
-    ({"zarr.json": json_edit(lambda t: t["attributes"].update(kind="patches"))}, "patches"),
+    ({"zarr.json": json_edit(lambda t: t["attributes"].update(kind="voxels"))}, "voxels"),
     ({"zarr.json": json_edit(lambda t: t["attributes"].update(format="other"))}, "other"),
     ({"zarr.json": json_edit(lambda t: t["attributes"]["values"].update(degree=9))}, None),
     ({"zarr.json": json_edit(lambda t: t["attributes"].pop("values"))}, None),

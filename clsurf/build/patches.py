@@ -99,10 +99,11 @@ def _checked(nodes, patches, spacing, error, views, precise) -> PatchRequest:
         whole = False
     if not whole or not (2 <= m <= 256 and 2 <= n <= 256):
         raise InputError(f"nodes: expected a number, or two, from 2 to 256, got {nodes!r}")
-    given = [name for name, value in (("patches", patches), ("spacing", spacing), ("error", error)) if value is not None]
+    one_of = (("patches", patches), ("spacing", spacing), ("error", error))
+    given = [name for name, value in one_of if value is not None]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)}: expected only one of patches, spacing and error")
-    for name, value in (("patches", patches), ("spacing", spacing), ("error", error), ("views", views)):
+    for name, value in (*one_of, ("views", views)):
         if value is None:
             continue
         number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
