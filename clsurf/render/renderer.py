@@ -7,6 +7,7 @@ import numpy as np
 
 from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
+from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .frame import Frame
 from .scene import as_scene
@@ -52,7 +53,7 @@ class Renderer:
 
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
-               background=(1.0, 1.0, 1.0, 1.0)) -> Frame:
+               background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -71,6 +72,10 @@ class Renderer:
             8 a fast mode that shows, 0 draws the leaves only.
         background : 3 or 4 floats
             sRGB with straight alpha, 0 to 1.
+        supersampling : int
+            1 to 4: samples along each side of a pixel. The picture is drawn that much larger, so thresholds in pixels
+            count samples; "color" is the mean, every other channel that of the sample at the pixel's centre, or, for 2
+            and 4, of the nearest in depth of the four around it.
 
         Returns
         -------
@@ -86,6 +91,9 @@ class Renderer:
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
+        factor = checked_supersampling(supersampling)
+        picture, size = size, checked_size([n * factor for n in size])
+        wanted, channels = channels, fine_channels(channels, factor)
         shading = Shading() if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
         if not isinstance(shading, Shading):
             raise InputError(f"shading: expected a clsurf.Shading or the name of a look, got {shading!r}")
@@ -100,6 +108,8 @@ class Renderer:
                 self._draw(grid, number, surface, matrix, camera, lod, shading)
             origin = scene_origin(scene)
             arrays = self._shade(grid, camera, origin, scene.lights, shading, background, channels)
+            if factor > 1:
+                arrays = average(self.device, arrays, picture, factor, wanted, self._scratch.lanes)
             return Frame({name: self.device.download(array, copy=False) for name, array in arrays.items()}, origin,
                          camera)
         finally:
@@ -189,12 +199,13 @@ def checked_lod(lod) -> float:
 
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
-           background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None) -> Frame:
+           background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
-    return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background)
+    return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
+                                                supersampling)
 
 
 _shared = threading.local()
