@@ -6,3 +6,4 @@ from .basic import disc as disc
 from .basic import ellipsoid as ellipsoid
 from .basic import sphere as sphere
 from .basic import torus as torus
+from .perfect_sphere import perfect_sphere as perfect_sphere
