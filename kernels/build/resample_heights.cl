@@ -1,0 +1,109 @@
+// Heights of a triangle mesh over the nodes of patches, one work-item a patch.
+//
+// A patch owns the first faces of its list; the rest lie around them. A node is needed where an own face meets one of the
+// four cells around it, or comes within REACH - 1 steps of them. Its height is that of the own face above it, the highest
+// of several; beyond the own faces that of the face around which lies closest to the plane of the nearest own face, if it
+// is within GAP_LIMIT steps of it; otherwise that plane, its slope limited. Scratch: two floats a node.
+//
+// Paper on spatial patches, section 4.1 ("can be converted to patches, since ... projected onto a plane").
+#include "build/patch_frame.clh"
+
+#ifndef REACH
+#define REACH 1.25f       // half the side of the square around a node that an own face must meet, node steps
+#endif
+#ifndef SLOPE_LIMIT
+#define SLOPE_LIMIT 2.0f  // of planes that are carried on beyond their faces
+#endif
+#ifndef GAP_LIMIT
+#define GAP_LIMIT 1.5f    // steps
+#endif
+#define FLAT_AREA 1e-9f   // a triangle seen edge-on: no plane over it
+
+#define OWN -1.0f         // ring gap of nodes under an own face
+#define UNNEEDED -2.0f
+
+typedef struct { int i0, i1, j0, j1; } NodeBox;
+
+inline NodeBox nodes_around(const FlatTriangle *t, float reach, int m, int n) {
+  float x0 = min(t->x[0], min(t->x[1], t->x[2])) - reach, x1 = max(t->x[0], max(t->x[1], t->x[2])) + reach;
+  float y0 = min(t->y[0], min(t->y[1], t->y[2])) - reach, y1 = max(t->y[0], max(t->y[1], t->y[2])) + reach;
+  NodeBox box;  // clamped before the conversion: far triangles would overflow
+  box.i0 = (int)ceil(clamp(x0, 0.0f, (float)m));
+  box.i1 = (int)floor(clamp(x1, -1.0f, (float)(m - 1)));
+  box.j0 = (int)ceil(clamp(y0, 0.0f, (float)n));
+  box.j1 = (int)floor(clamp(y1, -1.0f, (float)(n - 1)));
+  return box;
+}
+
+// Whether the square of half side REACH around (x, y) meets the triangle, given that it meets its box.
+inline bool meets(const FlatTriangle *t, float side, float x, float y) {
+  for (int k = 0; k < 3; k++) {
+    int b = k == 2 ? 0 : k + 1;
+    float dx = (t->x[b] - t->x[k]) * side, dy = (t->y[b] - t->y[k]) * side;
+    float edge = dx * (y - t->y[k]) - dy * (x - t->x[k]);
+    if (edge + REACH * (fabs(dx) + fabs(dy)) < 0.0f) return false;
+  }
+  return true;
+}
+
+// Height at (x, y) of the triangle's plane, carried on from its nearest point with a limited slope.
+inline float carried_height(const FlatTriangle *t, float area, float x, float y, const float *weight) {
+  float nx = weight[0] * t->x[0] + weight[1] * t->x[1] + weight[2] * t->x[2];
+  float ny = weight[0] * t->y[0] + weight[1] * t->y[1] + weight[2] * t->y[2];
+  float nz = weight[0] * t->z[0] + weight[1] * t->z[1] + weight[2] * t->z[2];
+  if (fabs(area) <= FLAT_AREA) return nz;
+  float ax = t->x[1] - t->x[0], ay = t->y[1] - t->y[0], az = t->z[1] - t->z[0];
+  float bx = t->x[2] - t->x[0], by = t->y[2] - t->y[0], bz = t->z[2] - t->z[0];
+  float gx = (az * by - bz * ay) / area, gy = (bz * ax - az * bx) / area;
+  float slope = sqrt(gx * gx + gy * gy);
+  float scale = slope > SLOPE_LIMIT ? SLOPE_LIMIT / slope : 1.0f;
+  return nz + scale * (gx * (x - nx) + gy * (y - ny));
+}
+
+__kernel void resample_heights(int patches, __global const float *frames, __global const int *size,
+                               __global const int *node_offset, __global const int *list_offset,
+                               __global const int *own_count, __global const int *list, __global const int *faces,
+                               __global const float *vertices, __global float *distance, __global float *gap,
+                               __global float *heights, __global int *source) {
+  int p = get_global_id(0);
+  if (p >= patches) return;
+  __global const float *frame = frames + FRAME_FLOATS * (size_t)p;
+  int m = size[2 * p], n = size[2 * p + 1], first = node_offset[p];
+  for (int k = first; k < first + m * n; k++) {
+    distance[k] = INFINITY;
+    gap[k] = UNNEEDED;
+    heights[k] = NAN;
+    source[k] = -1;
+  }
+  for (int at = list_offset[p]; at < list_offset[p + 1]; at++) {
+    bool own = at < list_offset[p] + own_count[p];
+    FlatTriangle t = flat_triangle(frame, vertices, faces + 3 * (size_t)list[at]);
+    float area = doubled_area(&t), side = area < 0.0f ? -1.0f : 1.0f, weight[3];
+    if (!own && area <= FLAT_AREA) continue;  // what faces down is another side of the surface
+    NodeBox box = nodes_around(&t, own ? REACH : 0.0f, m, n);
+    for (int j = box.j0; j <= box.j1; j++)
+      for (int i = box.i0; i <= box.i1; i++) {
+        int k = first + j * m + i;
+        float x = i, y = j;
+        if (own ? !meets(&t, side, x, y) : distance[k] == INFINITY || gap[k] == OWN) continue;
+        float d2 = nearest_weights(&t, area, x, y, weight);
+        if (own) {
+          float z = carried_height(&t, area, x, y, weight);
+          if (d2 > distance[k] || (d2 == distance[k] && z <= heights[k])) continue;
+          distance[k] = d2;
+          heights[k] = z;
+          source[k] = list[at];
+          gap[k] = d2 > 0.0f ? INFINITY : OWN;
+        } else if (d2 == 0.0f) {
+          // heights[k] goes on holding the own plane, distance[k] takes the height found
+          float z = weight[0] * t.z[0] + weight[1] * t.z[1] + weight[2] * t.z[2], miss = fabs(z - heights[k]);
+          if (miss > GAP_LIMIT || miss >= gap[k]) continue;
+          distance[k] = z;
+          source[k] = list[at];
+          gap[k] = miss;
+        }
+      }
+  }
+  for (int k = first; k < first + m * n; k++)
+    heights[k] = frame[FRAME_STEP] * (gap[k] >= 0.0f && gap[k] < INFINITY ? distance[k] : heights[k]);
+}
