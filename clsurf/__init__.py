@@ -13,6 +13,7 @@ from .errors import Error
 from .io import load, save
 from .render.camera import Camera
 from .render.frame import Frame
+from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
 from .render.scene import Scene
 from .render.shade import Shading
@@ -25,7 +26,7 @@ from .surface.slim import SlimSurface
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Device", "Error", "Frame", "Mesh", "PatchSurface", "Placed", "PointCloud", "Profile", "Projection",
+    "Camera", "Device", "Error", "Frame", "Mesh", "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "Profile", "Projection",
     "Renderer", "Scene", "Shading", "SlimSurface", "build_patches", "build_slim", "errors", "estimate_normals", "load",
     "models", "open_device", "project", "render", "save",
 ]

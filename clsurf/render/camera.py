@@ -239,6 +239,9 @@ def _extent(thing, box) -> tuple[NDArray, NDArray | float]:
         leaf = thing.leaf if thing.leaf.any() else np.ones(len(thing.centers), bool)
         flat = np.sqrt(np.clip(1 - thing.normals[leaf].astype(np.float64) ** 2, 0, 1)).max(axis=1)
         return thing.centers[leaf] + thing.origin, thing.radii[leaf] * flat * (2 / 3)
+    if hasattr(thing, "boxes") and hasattr(thing, "displacement_ranges"):
+        points = thing.positions()
+        return points[np.isfinite(points[:, 0])], 0.0
     if hasattr(thing, "points") and len(thing.points):
         return thing.points + thing.origin, 0.0
     return np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]), 0.0

@@ -7,14 +7,20 @@ import numpy as np
 
 from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
+from ..surface.patch import PatchSurface
+from ..surface.slim import SlimSurface
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .frame import Frame
+from .patch_drawing import PatchDrawing
+from .patches import draw_patches, upload_patches
 from .scene import as_scene
-from .shade import CHANNELS, Shading, shade, shading_floats
+from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 
+# How each kind of surface is put on the device, and drawn into a grid.
+KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches)}
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -53,7 +59,7 @@ class Renderer:
 
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
-               background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1) -> Frame:
+               background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -65,7 +71,8 @@ class Renderer:
             Width and height in pixels.
         channels : sequence of str
             Of "color", "depth", "normal", "position", "id", "count", "level", "cost" (see `Frame`); "cost" is the
-            number of surfel evaluations per pixel of the pixel's bin of 8x8.
+            number of surfel evaluations per pixel of the pixel's bin of 8x8, or that of tests of a pixel against a
+            cell of a patch. For patches "count" is 1 and "level" the mip level, 0 for the patch's own nodes.
         shading : Shading, optional
         lod : float
             Surfels that appear up to this many pixels wide are drawn in place of the finer ones below them: 4 is safe,
@@ -76,6 +83,8 @@ class Renderer:
             1 to 4: samples along each side of a pixel. The picture is drawn that much larger, so thresholds in pixels
             count samples; "color" is the mean, every other channel that of the sample at the pixel's centre, or, for 2
             and 4, of the nearest in depth of the four around it.
+        patches : PatchDrawing, optional
+            How spatial patches are drawn.
 
         Returns
         -------
@@ -97,6 +106,9 @@ class Renderer:
         shading = Shading() if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
         if not isinstance(shading, Shading):
             raise InputError(f"shading: expected a clsurf.Shading or the name of a look, got {shading!r}")
+        patches = PatchDrawing() if patches is None else patches
+        if not isinstance(patches, PatchDrawing):
+            raise InputError(f"patches: expected a clsurf.PatchDrawing, got {patches!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
@@ -105,7 +117,7 @@ class Renderer:
             # The stages of a frame.
             grid = self._new_grid(scene, size, channels, shading)
             for number, (surface, matrix) in enumerate(scene.placed):
-                self._draw(grid, number, surface, matrix, camera, lod, shading)
+                self._draw(grid, number, surface, matrix, camera, Look(shading, lod, patches))
             origin = scene_origin(scene)
             arrays = self._shade(grid, camera, origin, scene.lights, shading, background, channels)
             if factor > 1:
@@ -121,7 +133,8 @@ class Renderer:
 
     def _new_grid(self, scene, size, channels, shading) -> Grid:
         """Return bins that nothing has touched yet."""
-        colored = shading.model_colors and any(s.colors is not None for s, _ in scene.placed)
+        colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
+                                               for s, _ in scene.placed)
         colored |= shading.look.startswith("ball")
         layout = Layout(color=colored and "color" in channels, id="id" in channels, count="count" in channels,
                         level="level" in channels)
@@ -134,11 +147,12 @@ class Renderer:
         return Grid(size, self.tile_bins, layout, touched,
                     self._scratch.array("planes", (bins, fields, 64), np.float32))
 
-    def _draw(self, grid, number, surface, matrix, camera, lod, shading) -> None:
+    def _draw(self, grid, number, surface, matrix, camera, look) -> None:
+        put, draw = KINDS[type(surface)]
         upload = self._uploads.get(surface)
         if upload is None:
-            upload = self._uploads[surface] = upload_slim(self.device, surface)
-        draw_slim(self.device, self._scratch, grid, upload, matrix, camera, lod, shading, number)
+            upload = self._uploads[surface] = put(self.device, surface)
+        draw(self.device, self._scratch, grid, upload, matrix, camera, look, number)
 
     def _shade(self, grid, camera, origin, lights, shading, background, channels):
         offset = camera.eye - origin
@@ -199,13 +213,14 @@ def checked_lod(lod) -> float:
 
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
-           background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1) -> Frame:
+           background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
+           patches: PatchDrawing | None = None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling)
+                                                supersampling, patches)
 
 
 _shared = threading.local()

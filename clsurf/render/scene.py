@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
 from .shade import Light
 
-DRAWABLE = (SlimSurface,)
+DRAWABLE = (SlimSurface, PatchSurface)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ class Scene:
             if not isinstance(own, DRAWABLE):
                 raise InputError(f"scene: surface {i} is a {type(own).__name__}, expected one of "
                                  f"{', '.join(kind.__name__ for kind in DRAWABLE)}, plain or placed: build a surface "
-                                 "from a scan first (clsurf.build_slim)")
+                                 "from a scan first (clsurf.build_slim, clsurf.build_patches)")
 
     @property
     def placed(self) -> list[tuple[object, NDArray | None]]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from .patch_drawing import PatchDrawing
 from .tiles import BIN, Grid, Scratch
 
 CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np.float32), "position": (3, np.float32),
@@ -75,6 +76,15 @@ class Shading:
             raise InputError(f"shading look: expected one of {', '.join(LOOKS)}, got {self.look!r}")
         if self.shininess != int(self.shininess) or not 0 <= self.shininess <= 4096:
             raise InputError(f"shading shininess: expected a whole number from 0 to 4096, got {self.shininess}")
+
+
+@dataclass(frozen=True)
+class Look:
+    """Everything but the view that decides how the surfaces of a frame are drawn; see `Renderer.render`."""
+
+    shading: Shading
+    lod: float
+    patches: PatchDrawing
 
 
 def to_linear(srgb):

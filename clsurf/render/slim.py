@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.slim import SlimSurface
-from .shade import Shading, to_linear
+from .shade import Look, Shading, to_linear
 from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, new_footprints, view_floats
 
 RECORD_FLOATS = 32  # kernels/common/slim.clh
@@ -268,11 +268,12 @@ def tile_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, 
         grid.bins_y, grid.touched, grid.planes)
 
 
-def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, matrix, camera, lod: float,
-              shading: Shading, number: int) -> None:
+def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, matrix, camera, look: Look,
+              number: int) -> None:
     """Run all stages of one placed surface: select, project, bin, tile."""
     if upload.count == 0:
         return
+    shading, lod = look.shading, look.lod
     balls = shading.look.startswith("ball")
     one_level = balls and shading.level is not None
     floats, visited_end = place_slim(upload, matrix, camera, grid.size, 0.0 if one_level else lod)

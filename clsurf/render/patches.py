@@ -1,0 +1,143 @@
+"""Spatial patches in the renderer: upload, projection and the tile stage.
+
+Source: the paper on spatial patches, section 3. Kernels: kernels/render/*patch*.cl, kernels/common/patch.clh.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device, DeviceArray
+from ..errors import InputError
+from ..surface.patch import PatchSurface
+from .shade import Look, Shading, to_linear
+from .tiles import BIN, Grid, Scratch, view_floats
+
+FRAME_FLOATS, PATCH_FLOATS = 16, 24  # kernels/common/patch.clh
+LAYERS = (1 << 20) - 2  # kernels/render/patch_planes.clh
+LAYER_SPACINGS = 0.25  # samples of one surface within this many node spacings of depth are one layer
+LARGEST_COUNT = (1 << 32) - 2  # a node's number is a payload of 32 bits
+
+
+@dataclass(frozen=True, eq=False)
+class PatchUpload:
+    """A `PatchSurface` on a device (kernels/common/patch.clh)."""
+
+    count: int
+    channels: int  # bytes of a node's colour: 0, 3, 4
+    precise: bool
+    frames: DeviceArray  # (count, FRAME_FLOATS) float32
+    sizes: DeviceArray  # (count, 2) int32
+    offsets: DeviceArray  # (count + 1,) uint32
+    heights: DeviceArray  # (N,) int8 or int32
+    colors: DeviceArray  # (N * channels,) uint8
+    cells: DeviceArray  # (N,) uint8: 1 where the cell is drawn
+    borders: DeviceArray  # (N,) float32: distance to the border of what is drawn, model units
+    slopes: DeviceArray  # (N, 2) float32: displacement steps per node
+    linear: DeviceArray  # (256,) float32
+    color: NDArray | None  # (3,) float64, linear
+    largest_border: float  # model units
+    spacing: float  # median node spacing, model units
+    origin: NDArray  # (3,) float64
+    center: NDArray  # (3,) float64, relative to origin
+    reach: float  # everything lies within this of `center`
+
+
+def patch_constants(upload: PatchUpload) -> dict[str, int]:
+    """Return the constants of every kernel that reads patches."""
+    return {"CHANNELS": upload.channels, "PRECISE": upload.precise}
+
+
+def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
+    """Put a surface on the device, with what the renderer needs to know of its nodes.
+
+    Raises
+    ------
+    InputError
+        More nodes than an index holds.
+    DeviceMemoryError
+    """
+    p, nodes = len(surface), surface.node_count
+    if nodes > LARGEST_COUNT:
+        raise InputError(f"surface: expected at most {LARGEST_COUNT:,} nodes to draw, got {nodes:,}: split it")
+    device.check_memory(nodes=surface.displacements.nbytes + 13 * nodes, patches=4 * FRAME_FLOATS * p)
+    frames = np.zeros((max(p, 1), FRAME_FLOATS), np.float32)
+    for i, values in enumerate((surface.origins, surface.axis_x, surface.axis_y, surface.axis_z)):
+        frames[:p, 3 * i:3 * i + 3] = values
+    frames[:p, 12:14] = surface.displacement_ranges
+    shown = frames[:p, 12] <= frames[:p, 13]
+    boxes = surface.boxes()[shown].reshape(-1, 3) - surface.origin
+    center = (boxes.min(axis=0) + boxes.max(axis=0)) / 2 if len(boxes) else np.zeros(3)
+    reach = float(np.linalg.norm(boxes - center, axis=1).max()) if len(boxes) else 0.0
+    spacing = float(np.median(np.linalg.norm(surface.axis_x, axis=1))) if p else 1.0
+    channels = 0 if surface.colors is None else surface.colors.shape[1]
+    heights = device.upload(surface.displacements if nodes else np.zeros(1, np.int8))
+    colors = device.upload(surface.colors.reshape(-1) if channels and nodes else np.zeros(4, np.uint8))
+    sizes = device.upload(np.ascontiguousarray(surface.size))
+    offsets = device.upload(surface.node_offset.astype(np.uint32))
+    frames = device.upload(frames)
+    cells, borders = device.empty(max(nodes, 1), np.uint8), device.empty(max(nodes, 1), np.float32)
+    slopes = device.empty((max(nodes, 1), 2), np.float32)
+    precise = surface.displacements.dtype == np.int32
+    device.kernel("render/prepare_patches.cl", constants={"CHANNELS": channels, "PRECISE": precise})(
+        (p,), None, frames, sizes, offsets, p, colors, heights, cells, borders, slopes)
+    largest = float(device.download(borders, copy=False)[:nodes].max(initial=0.0)) if nodes else 0.0
+    color = None if surface.color is None else to_linear(surface.color / 255)
+    return PatchUpload(p, channels, precise, frames, sizes, offsets, heights, colors, cells, borders, slopes,
+                       device.upload(to_linear(np.arange(256) / 255).astype(np.float32)), color, largest, spacing,
+                       surface.origin, center, reach)
+
+
+def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, shading: Shading) -> NDArray:
+    """Return the view buffer of a placed surface, kernels/common/view.clh and patch.clh."""
+    matrix = np.eye(4) if matrix is None else matrix
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    rotation = camera.rotation @ (matrix[:3, :3] / scale)
+    offset = camera.rotation @ (matrix[:3, :3] @ upload.origin + matrix[:3, 3] - camera.eye)
+    middle, reach = -(scale * rotation[2] @ upload.center + offset[2]), scale * upload.reach
+    first = middle - reach
+    if camera.projection(size).perspective:
+        first = max(first, 0.0)
+    view = view_floats(camera, size, rotation, offset, scale)
+    layer = max(LAYER_SPACINGS * scale * upload.spacing, (middle + reach - first) / LAYERS, 1e-30)
+    view[22], view[24] = first, 1 / layer
+    view[25] = 4095.99 / max(upload.largest_border, 1e-30)
+    own = shading.model_colors and upload.color is not None
+    view[26:29] = upload.color if own else to_linear(shading.color)
+    return view
+
+
+def project_patches(device: Device, scratch: Scratch, upload: PatchUpload,
+                    view: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+    """Return the projected patches (count, PATCH_FLOATS) and the pixels that each may touch, (count, 4) int32."""
+    records = scratch.array("patch_records", (upload.count, PATCH_FLOATS), np.float32)
+    rectangles = scratch.array("patch_rectangles", (upload.count, 4), np.int32)
+    device.kernel("render/project_patches.cl", constants=patch_constants(upload))(
+        (upload.count,), (min(64, upload.count),), view, upload.frames, upload.sizes, upload.count, records, rectangles)
+    return records, rectangles
+
+
+def tile_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, view: DeviceArray,
+                 records: DeviceArray, rectangles: DeviceArray, number: int, look: Look) -> None:
+    """Draw the patches of every tile into its planes; `number` is the surface's place in the scene."""
+    tile = grid.tile_bins * BIN
+    slots = scratch.array("patch_slots", (grid.tile_count, tile * tile, 2), np.uint32)
+    constants = grid.layout.constants | patch_constants(upload) | {"TILE_BINS": grid.tile_bins,
+                                                                   "TRIANGLES": look.patches.cells == "triangles"}
+    if not (grid.layout.color and look.shading.model_colors):
+        constants["CHANNELS"] = 0
+    device.kernel("render/tile_patches.cl", constants=constants)(
+        (grid.tile_count,), (1,), view, rectangles, records, upload.sizes, upload.offsets, upload.count,
+        upload.heights, upload.cells, upload.borders, upload.slopes, upload.colors, upload.linear, number,
+        grid.tiles_x, grid.tile_count, grid.bins_x, grid.bins_y, slots, grid.touched, grid.planes)
+
+
+def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, matrix, camera, look: Look,
+                 number: int) -> None:
+    """Run all stages of one placed surface: project, tile."""
+    if upload.count == 0:
+        return
+    view = device.upload(place_patches(upload, matrix, camera, grid.size, look.shading))
+    records, rectangles = project_patches(device, scratch, upload, view)
+    tile_patches(device, scratch, grid, upload, view, records, rectangles, number, look)
