@@ -26,7 +26,7 @@ from .surface.slim import SlimSurface
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Device", "Error", "Frame", "Mesh", "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "Profile", "Projection",
-    "Renderer", "Scene", "Shading", "SlimSurface", "build_patches", "build_slim", "errors", "estimate_normals", "load",
-    "models", "open_device", "project", "render", "save",
+    "Camera", "Device", "Error", "Frame", "Mesh", "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "Profile",
+    "Projection", "Renderer", "Scene", "Shading", "SlimSurface", "build_patches", "build_slim", "errors",
+    "estimate_normals", "load", "models", "open_device", "project", "render", "save",
 ]
