@@ -1,0 +1,97 @@
+"""Coarser levels of patches for minification: 2:1 averages of the nodes that keep the outline of every patch.
+
+The paper names mip-mapping-like filtering as future work (section 6). A level is a `PatchSurface` again, with the
+same patches in the same order, so that every mode draws it.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..surface.patch import PatchSurface, opaque_nodes
+from .shade import to_linear
+
+
+def mip_levels(surface: PatchSurface, most: int = 8) -> list[PatchSurface]:
+    """Return the surface and its coarser levels, down to 2 x 2 nodes or `most` levels.
+
+    m nodes become (m + 2) // 2, spread evenly between the same two ends: 17, 9, 5, 3, 2.
+    """
+    levels = [surface]
+    while len(levels) < most and len(surface) and (levels[-1].size > 2).any():
+        levels.append(halved(levels[-1]))
+    return levels
+
+
+def halved(surface: PatchSurface) -> PatchSurface:
+    """Return the next coarser level of a surface.
+
+    A coarse node is the tent-weighted mean of the opaque nodes less than one coarse step away; transparent where less
+    than half of that weight is opaque. Nodes on a border average along it only, so that the outline of a patch and what
+    it meets there stay (a mean across it would pull the rim inwards). Colours are averaged in linear light.
+    """
+    size = surface.size.astype(np.int64)
+    coarse = (size + 2) // 2
+    channels = 1 if surface.colors is None else 1 + surface.colors.shape[1]
+    offset = np.concatenate([[0], np.cumsum(coarse.prod(axis=1))])
+    values, cover = np.zeros((offset[-1], channels)), np.zeros(offset[-1])
+    for m, n in np.unique(size, axis=0):  # all patches of one size at once
+        which = np.flatnonzero((size == (m, n)).all(axis=1))
+        whole = len(which) == len(surface)
+        nodes = slice(None) if whole else (surface.node_offset[which][:, None] + np.arange(m * n)).ravel()
+        out = slice(None) if whole else (offset[which][:, None] + np.arange(((m + 2) // 2) * ((n + 2) // 2))).ravel()
+        values[out], cover[out] = _averaged(surface, nodes, m, n)
+    kind = surface.displacements.dtype
+    opaque, least = cover >= 0.5, np.iinfo(kind).min
+    d = np.where(opaque, np.rint(values[:, 0]), least if surface.colors is None else 0).astype(kind)
+    colors = None if surface.colors is None else _encoded(values[:, 1:], opaque)
+    scale = (size - 1) / (coarse - 1)
+    return PatchSurface(
+        surface.origins, surface.axis_x * scale[:, :1], surface.axis_y * scale[:, 1:], surface.axis_z_length, coarse, d,
+        colors, surface.color, surface.origin, surface.diagonal, surface.bound, surface.bound_share, surface.oriented)
+
+
+def tent(nodes: int) -> NDArray:
+    """Return the weights (coarse, nodes) float64 of a row of nodes in its coarser row; straight lines stay."""
+    coarse = (nodes + 2) // 2
+    step = (nodes - 1) / (coarse - 1)
+    weights = np.clip(1 - np.abs(np.arange(nodes) - np.arange(coarse)[:, None] * step) / step, 0, 1)
+    weights[[0, -1]] = 0
+    weights[0, 0] = weights[-1, -1] = 1
+    weights /= weights.sum(axis=1, keepdims=True)
+    # Where a coarse node falls between fine ones, their mean lies beside it: tilt the weights until it does not.
+    places = np.arange(nodes) - (weights @ np.arange(nodes))[:, None]
+    off = np.arange(coarse) * step - weights @ np.arange(nodes)
+    return weights * (1 + places * (off / np.maximum((weights * places ** 2).sum(axis=1), 1e-9))[:, None])
+
+
+def _averaged(surface, nodes, m, n):
+    """Return the mean displacement and linear colours (q, channels) and the opaque share (q,) of coarse nodes."""
+    d = surface.displacements[nodes]
+    colors = None if surface.colors is None else surface.colors[nodes]
+    opaque = opaque_nodes(d, colors)
+    parts = [d.astype(np.float64)]
+    if colors is not None:
+        linear = to_linear(np.arange(256) / 255)[colors[:, :3]]
+        alpha = colors[:, 3:] / 255
+        parts += [*(linear * alpha if alpha.size else linear).T, *alpha.T]
+    across, along = tent(int(m)), tent(int(n))
+    mean = lambda a: along @ (a.reshape(-1, n, m) @ across.T)  # noqa: E731
+    cover = mean(opaque.astype(np.float64)).ravel()
+    sums = np.stack([mean(np.where(opaque, part, 0)).ravel() for part in parts], axis=1)
+    return sums / np.maximum(cover, 1e-30)[:, None], cover
+
+
+def _encoded(linear, opaque):
+    """Return node colours (q, 3 or 4) uint8 from linear ones, premultiplied where there is an alpha."""
+    if linear.shape[1] == 4:
+        linear = linear.copy()
+        linear[:, :3] /= np.maximum(linear[:, 3:], 1e-9)
+    rgb = np.clip(linear[:, :3], 0, 1)
+    srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
+    out = np.rint(255 * np.concatenate([srgb, linear[:, 3:]], axis=1)).astype(np.uint8)
+    if out.shape[1] == 4:
+        out[:, 3] = np.maximum(out[:, 3], 1)
+    else:
+        out[~out.any(axis=1)] = 1  # pure black is transparent
+    out[~opaque] = 0
+    return out
