@@ -173,7 +173,7 @@ def surfel_footprints(points, normals, center, record, degree, limited=0.7):
     u, v, w = d @ u_axis, d @ v_axis, d @ surfel[1:4]
     c = surfel[6:6 + (1 if degree == 1 else terms(degree))]
     own = ((d**2).sum(axis=1) < surfel[0] ** 2) & (normals @ surfel[1:4] > 0.3)
-    own &= np.abs(w - height(c, u, v)) < 0.15 * surfel[0]
+    own &= np.abs(w - height(c, u, v)) < max(0.15 * surfel[0], 4 * surfel[4])
     angle = np.arange(8) * np.pi / 4
     reach = (u[own, None] * np.cos(angle) + v[own, None] * np.sin(angle)).max(axis=0) / surfel[0]
     share = reach + 0.08 * np.sqrt(np.pi / own.sum())
