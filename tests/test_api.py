@@ -134,3 +134,21 @@ def test_docstrings(thing):
             assert re.search(rf"\b{name}\b.* : ", described), name
         if inspect.signature(thing).return_annotation not in (None, "None"):
             assert "Returns\n---" in text or text.startswith("Return")
+
+
+@pytest.mark.parametrize("call", [
+    lambda: clsurf.project(clsurf.models.sphere(10), "x"),
+    lambda: clsurf.project(clsurf.models.sphere(10), [[0, 0, 0]]),
+    lambda: clsurf.estimate_normals(3), lambda: clsurf.estimate_normals(clsurf.models.sphere(10), k="x"),
+    lambda: clsurf.estimate_normals(clsurf.models.sphere(10), orient={1}), lambda: clsurf.Shading(color="red"),
+    lambda: clsurf.Shading(ambient="x"), lambda: clsurf.Shading(shininess=None)])
+def test_wrong_arguments_are_named_in_one_line(call):
+    with pytest.raises(clsurf.errors.InputError, match=r"expected .*, got") as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_texts_are_short(device):
+    surface = clsurf.build_slim(clsurf.models.sphere(500), device=device)
+    for thing in (clsurf.Scene([surface]), clsurf.Renderer(device), clsurf.project(surface, np.zeros((3, 3)), device)):
+        assert "\n" not in repr(thing) and len(repr(thing)) < 120

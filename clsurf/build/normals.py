@@ -54,8 +54,10 @@ def estimate_normals(cloud: PointCloud, k="auto", orient="auto", progress=None, 
     Cancelled
         `progress` returned False.
     """
+    if not hasattr(cloud, "points"):
+        raise InputError(f"cloud: expected a PointCloud, got {cloud!r:.60}: clsurf.load reads one from a file")
     orient = _checked_orient(cloud, orient)
-    if k != "auto" and not 3 <= k <= LARGEST_K:
+    if k != "auto" and not (isinstance(k, int | np.integer) and 3 <= k <= LARGEST_K):
         raise InputError(f"k: expected 'auto' or 3 to {LARGEST_K} neighbours, got {k!r}")
     if len(cloud.points) == 0:
         return dataclasses.replace(cloud, normals=np.zeros((0, 3), np.float32))
@@ -92,7 +94,10 @@ def _checked_orient(cloud, orient):
     if orient is None:
         return None
     if not isinstance(orient, str):
-        viewpoint = np.asarray(orient, np.float64)
+        try:
+            viewpoint = np.asarray(orient, np.float64)
+        except (TypeError, ValueError):
+            viewpoint = np.empty(0)
         if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
             raise InputError(f"orient: expected a viewpoint of 3 finite numbers, got {orient!r}")
         return viewpoint

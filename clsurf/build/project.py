@@ -16,7 +16,7 @@ LEAF = 24  # floats a leaf (project_points.cl)
 BATCH = 1 << 22  # queries of one launch
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Projection:
     """Nearest points on a surface, world space, float64.
 
@@ -31,6 +31,9 @@ class Projection:
     position: NDArray
     normal: NDArray
     distance: NDArray
+
+    def __repr__(self):
+        return f"Projection({len(self.distance):,} points)"
 
 
 @dataclass(eq=False)
@@ -72,7 +75,10 @@ def project(surface, points, device=None) -> Projection:
     InputError
         Positions of another shape or not finite, or a surface without leaves.
     """
-    points = np.asarray(points, np.float64)
+    try:
+        points = np.asarray(points, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"points: expected an array of numbers of shape (n, 3), got {points!r:.60}") from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points: expected an array of shape (n, 3), got {points.shape}")
     if not np.isfinite(points).all():

@@ -167,6 +167,10 @@ class Renderer:
             self._scratch = None
             self._uploads.clear()
 
+    def __repr__(self):
+        state = "closed" if self._scratch is None else f"tiles of {BIN * self.tile_bins} pixels"
+        return f"Renderer({self.device.name}, {state})"
+
     def __enter__(self):
         return self
 

@@ -14,7 +14,7 @@ from .shade import Light
 DRAWABLE = (SlimSurface, PatchSurface)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Surfaces that meet in one z-buffer.
 
@@ -45,6 +45,9 @@ class Scene:
                 raise InputError(f"scene: surface {i} is a {type(own).__name__}, expected one of "
                                  f"{', '.join(kind.__name__ for kind in DRAWABLE)}, plain or placed: build a surface "
                                  "from a scan first (clsurf.build_slim, clsurf.build_patches)")
+
+    def __repr__(self):
+        return f"Scene({len(self.surfaces)} surfaces, {len(self.lights)} lights)"
 
     @property
     def placed(self) -> list[tuple[object, NDArray | None]]:

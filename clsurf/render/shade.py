@@ -74,8 +74,21 @@ class Shading:
     def __post_init__(self):
         if self.look not in LOOKS:
             raise InputError(f"shading look: expected one of {', '.join(LOOKS)}, got {self.look!r}")
+        checks = [("color", 3), ("ambient", 0), ("diffuse", 0), ("specular", 0), ("shininess", 0)]
+        for name, count in checks:
+            _checked_numbers(name, getattr(self, name), count)
         if self.shininess != int(self.shininess) or not 0 <= self.shininess <= 4096:
             raise InputError(f"shading shininess: expected a whole number from 0 to 4096, got {self.shininess}")
+
+
+def _checked_numbers(name, value, count) -> None:
+    """Raise InputError unless `value` is `count` finite numbers (0: one number)."""
+    try:
+        wrong = np.shape(value) != ((count,) if count else ()) or not np.isfinite(np.asarray(value, np.float64)).all()
+    except (TypeError, ValueError):
+        wrong = True
+    if wrong:
+        raise InputError(f"shading {name}: expected {f'{count} numbers' if count else 'a number'}, got {value!r}")
 
 
 @dataclass(frozen=True)
