@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..device import open_device
-from ..errors import InputError
+from ..errors import Cancelled, InputError
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -49,7 +49,7 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     precise : bool
         RGBA and 32-bit displacements, 8 bytes a node in place of 4.
     progress : callable, optional
-        Called as progress(fraction, what); raising `clsurf.errors.Cancelled` in it stops the build.
+        Called as progress(stage, done) with done from 0 to 1; returning False stops the build.
     device : str, Device, ..., optional
 
     Returns
@@ -60,6 +60,8 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     ------
     InputError
         An option or a scan that cannot be used; more than one of `patches`, `spacing`, `error`.
+    Cancelled
+        `progress` returned False.
 
     Notes
     -----
@@ -67,13 +69,20 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     """
     if not isinstance(scan, Mesh | PointCloud) and not hasattr(scan, "images"):
         scan = _loaded(scan)
-    request = _checked(nodes, patches, spacing, error, views, precise)
+    request = checked_request(nodes, patches, spacing, error, views, precise)
     method = _method_of(scan) if method is None else method
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     module = importlib.import_module(f"{__package__}.{METHODS[method]}")
-    progress = (lambda fraction, what: None) if progress is None else progress
-    return module.convert(scan, request, open_device(device), progress)
+    return module.convert(scan, request, open_device(device), _step(progress))
+
+
+def _step(progress):
+    """Return the function step(fraction, what) that a conversion calls; it stops the build where the caller wants."""
+    def step(fraction, what):
+        if progress is not None and progress(what, fraction) is False:
+            raise Cancelled("build_patches: stopped by the progress callback")
+    return step
 
 
 def _loaded(path):
@@ -90,7 +99,7 @@ def _method_of(scan) -> str:
     return "areas" if isinstance(scan, Mesh) and len(scan.faces) else "local"
 
 
-def _checked(nodes, patches, spacing, error, views, precise) -> PatchRequest:
+def checked_request(nodes, patches, spacing, error, views, precise) -> PatchRequest:
     """Return the request, or raise InputError."""
     try:
         m, n = (nodes, nodes) if np.ndim(nodes) == 0 else nodes
