@@ -10,7 +10,7 @@ from .build.project import Projection, project
 from .build.slim import build_slim
 from .device import Device, Profile, open_device
 from .errors import Error
-from .io import load, save
+from .io import load, load_frames, save
 from .render.camera import Camera
 from .render.frame import Frame
 from .render.patch_drawing import PatchDrawing
@@ -21,12 +21,14 @@ from .surface.cloud import PointCloud
 from .surface.mesh import Mesh
 from .surface.patch import PatchSurface
 from .surface.placed import Placed
+from .surface.ranges import RangeImage, RangeScan
 from .surface.slim import SlimSurface
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Camera", "Device", "Error", "Frame", "Mesh", "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "Profile",
-    "Projection", "Renderer", "Scene", "Shading", "SlimSurface", "build_patches", "build_slim", "errors",
-    "estimate_normals", "load", "models", "open_device", "project", "render", "save",
+    "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading", "SlimSurface", "build_patches",
+    "build_slim", "errors", "estimate_normals", "load", "load_frames", "models", "open_device", "project", "render",
+    "save",
 ]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..device import open_device
 from ..errors import Cancelled, InputError
 from ..surface.cloud import PointCloud
+from ..surface.ranges import RangeScan
 from .neighbours import LARGEST_K, box_tree, covariance, sampled_covariance
 from .orientation import oriented_to, signs_of, voxel_means
 
@@ -27,8 +28,9 @@ def estimate_normals(cloud: PointCloud, k="auto", orient="auto", progress=None, 
 
     Parameters
     ----------
-    cloud : PointCloud
-        Points, finite; their order, colours and attributes are kept, normals already there are replaced.
+    cloud : PointCloud or RangeScan
+        Points, finite; range images become a cloud with scanner positions first. Their order, colours and
+        attributes are kept, normals already there are replaced.
     k : int or "auto"
         Neighbours, 3 to 128; all points where there are fewer. "auto": 16, or 48 where the noise of neighbouring
         points is as large as their spacing.
@@ -54,6 +56,8 @@ def estimate_normals(cloud: PointCloud, k="auto", orient="auto", progress=None, 
     Cancelled
         `progress` returned False.
     """
+    if isinstance(cloud, RangeScan):
+        cloud = cloud.to_points()
     if not hasattr(cloud, "points"):
         raise InputError(f"cloud: expected a PointCloud, got {cloud!r:.60}: clsurf.load reads one from a file")
     orient = _checked_orient(cloud, orient)

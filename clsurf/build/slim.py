@@ -20,6 +20,7 @@ from ..io import load
 from ..io.cleaning import first_of_duplicates
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
+from ..surface.ranges import RangeScan
 from ..surface.slim import COEFFICIENTS, SlimSurface
 from .point_tree import BLOCK, FAR_POINT, PointTree, build_point_tree
 from .project import leaf_tree, project_sorted
@@ -44,9 +45,9 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
 
     Parameters
     ----------
-    scan : Mesh, PointCloud, str or PathLike
+    scan : Mesh, PointCloud, RangeScan, str or PathLike
         A path is read with `clsurf.load`. Normals are taken from the scan, computed from the faces, or estimated, in
-        this order. Points that are not finite or have no normal are left out.
+        this order; those of range images face the sensors. Points that are not finite or have no normal are left out.
     degree : int
         Of the local polynomials: 1, 2 or 3.
     error : float or "auto"
@@ -81,8 +82,11 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
         raise InputError(f"error: expected a share of the diagonal between 0 and 1, or 'auto', got {error!r}")
     if isinstance(scan, str | os.PathLike):
         scan = load(scan)
+    if isinstance(scan, RangeScan):
+        scan = scan.to_points()
     if not isinstance(scan, Mesh | PointCloud):
-        raise InputError(f"scan: expected a Mesh, a PointCloud or the path of a scan, got {type(scan).__name__}")
+        raise InputError("scan: expected a Mesh, a PointCloud, a RangeScan or the path of a scan, got "
+                         f"{type(scan).__name__}")
     device = open_device(device)
     report = Reporter(progress)
     report("points", 0.0)

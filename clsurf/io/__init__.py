@@ -2,3 +2,4 @@
 
 from .dispatch import load as load
 from .dispatch import save as save
+from .ranges import load_frames as load_frames

@@ -5,11 +5,13 @@ from pathlib import Path
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
+from clsurf.surface.ranges import RangeScan
 from clsurf.surface.slim import SlimSurface
 
 from . import scans
 
 SURFACES = (".clsurf", ".slim2t")
+RANGES = (".conf", ".json")  # and folders of frames
 WRITES = (*scans.WRITES, *SURFACES)
 
 
@@ -20,11 +22,12 @@ def load(path):
     ----------
     path : path-like
         A scan (.ply .obj .stl .off .glb .gltf .xyz .txt .asc .pts .csv .npy .npz .las .laz), cleaned as `clean_scan`
-        does, or what `save` wrote: .clsurf, .slim2t.
+        does, or what `save` wrote: .clsurf, .slim2t. Range images: .conf (Stanford's, with its .ply files beside it),
+        or a folder of depth and colour frames or its .json file of intrinsics, as `load_frames` reads them.
 
     Returns
     -------
-    Mesh, PointCloud or SlimSurface
+    Mesh, PointCloud, RangeScan, SlimSurface or PatchSurface
 
     Raises
     ------
@@ -40,9 +43,15 @@ def load(path):
     if ending == ".slim2t":
         from .slim2t import load_slim2t
         return load_slim2t(path)
+    if ending == ".conf":
+        from .ranges import load_conf
+        return load_conf(path)
+    if ending == ".json" or (ending not in scans.READS and Path(path).is_dir()):
+        from .ranges import load_frames
+        return load_frames(path)
     if ending not in scans.READS:
         raise InputError(f"{path}: unknown format {ending or '(no ending)'}: expected one of "
-                         f"{' '.join((*scans.READS, *SURFACES))}")
+                         f"{' '.join((*scans.READS, *RANGES, *SURFACES))}")
     return scans.load_scan(path)
 
 
@@ -51,7 +60,7 @@ def save(thing, path) -> None:
 
     Parameters
     ----------
-    thing : Mesh, PointCloud or surface
+    thing : Mesh, PointCloud, RangeScan or surface
     path : path-like
         .clsurf for anything, .slim2t for a SlimSurface, and for scans what `load` reads, except .gltf.
 
@@ -70,7 +79,8 @@ def save(thing, path) -> None:
     elif ending in scans.WRITES and isinstance(thing, Mesh | PointCloud):
         scans.save_scan(thing, path)
     else:
-        allowed = (*scans.WRITES, ".clsurf") if isinstance(thing, Mesh | PointCloud) else SURFACES
+        allowed = ((*scans.WRITES, ".clsurf") if isinstance(thing, Mesh | PointCloud) else
+                   (".clsurf",) if isinstance(thing, RangeScan) else SURFACES)
         raise InputError(f"{path}: a {type(thing).__name__} cannot be written as {ending or '(no ending)'}: expected "
                          f"one of {' '.join(allowed)}")
 

@@ -15,9 +15,10 @@ from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 from clsurf.surface.patch import PatchSurface
+from clsurf.surface.ranges import RangeImage, RangeScan
 from clsurf.surface.slim import SlimSurface
 
-KINDS = {"slim": SlimSurface, "patches": PatchSurface, "mesh": Mesh, "points": PointCloud}
+KINDS = {"slim": SlimSurface, "patches": PatchSurface, "mesh": Mesh, "points": PointCloud, "ranges": RangeScan}
 
 
 def to_arrays(thing) -> tuple[str, dict[str, NDArray], dict[str, Any]]:
@@ -34,6 +35,8 @@ def to_arrays(thing) -> tuple[str, dict[str, NDArray], dict[str, Any]]:
     if kind is None:
         raise InputError(f"expected a surface or scan ({', '.join(c.__name__ for c in KINDS.values())}), "
                          f"got {type(thing).__name__}")
+    if isinstance(thing, RangeScan):
+        return kind, *_range_arrays(thing)
     arrays: dict[str, NDArray] = {}
     scalars: dict[str, Any] = {}
     for field in dataclasses.fields(thing):
@@ -62,6 +65,8 @@ def from_arrays(kind: str, arrays: dict[str, NDArray], scalars: dict[str, Any]):
         An unknown kind, or arrays that do not fit together.
     """
     cls = KINDS[kind]
+    if cls is RangeScan:
+        return _range_scan(arrays)
     if kind in _PACKING:
         arrays = _PACKING[kind][1](arrays)
     values: dict[str, Any] = {}
@@ -75,6 +80,30 @@ def from_arrays(kind: str, arrays: dict[str, NDArray], scalars: dict[str, Any]):
             prefix = field.name + "/"
             values[field.name] = {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
     return cls(**values)
+
+
+def _range_arrays(scan: RangeScan) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """Return the arrays of each image under its number, such as 0/depth; names are bytes."""
+    arrays = {}
+    for k, image in enumerate(scan.images):
+        for name in _RANGE_FIELDS:
+            if getattr(image, name) is not None:
+                arrays[f"{k}/{name}"] = getattr(image, name)
+        if image.name:
+            arrays[f"{k}/name"] = np.frombuffer(image.name.encode(), np.uint8)
+    return arrays, {}
+
+
+def _range_scan(arrays: dict[str, NDArray]) -> RangeScan:
+    images: dict[int, dict] = {}
+    for key, array in arrays.items():
+        number, _, name = key.partition("/")
+        if name in (*_RANGE_FIELDS, "name"):
+            images.setdefault(int(number), {})[name] = bytes(array).decode() if name == "name" else array
+    return RangeScan([RangeImage(**images[number]) for number in sorted(images)])
+
+
+_RANGE_FIELDS = ("depth", "intrinsics", "points", "color", "pose", "eye")
 
 
 def _pack_slim(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
