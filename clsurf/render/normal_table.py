@@ -56,13 +56,18 @@ def half_steps(surface: PatchSurface) -> tuple[NDArray, NDArray]:
     transparent nodes the values mean nothing.
     """
     d, opaque = surface.displacements.astype(np.int64), surface.opaque
-    if surface.equal_sizes and len(surface):  # no index arrays: 20 instead of 90 ms for 450K nodes
+    return node_differences(surface, d, 0, opaque), node_differences(surface, d, 1, opaque)
+
+
+def node_differences(surface: PatchSurface, values: NDArray, axis: int, opaque: NDArray | None = None) -> NDArray:
+    """Return the differences (N,) int64 of a whole number per node along x (axis 0) or y, per two nodes."""
+    opaque = surface.opaque if opaque is None else opaque
+    if surface.equal_sizes and len(surface):  # all patches at once
         m, n = (int(v) for v in surface.size[0])
-        d, opaque = d.reshape(-1, n, m), opaque.reshape(-1, n, m)
-        return tuple(_differences(d, opaque, axis).ravel() for axis in (2, 1))
-    parts = [[_differences(d[a:b].reshape(1, n, m), opaque[a:b].reshape(1, n, m), axis).ravel() for axis in (2, 1)]
+        return _differences(values.reshape(-1, n, m), opaque.reshape(-1, n, m), 2 - axis).ravel()
+    parts = [_differences(values[a:b].reshape(1, n, m), opaque[a:b].reshape(1, n, m), 2 - axis).ravel()
              for a, b, (m, n) in zip(surface.node_offset[:-1], surface.node_offset[1:], surface.size, strict=True)]
-    return tuple(np.concatenate([np.zeros(0, np.int64), *(p[i] for p in parts)]) for i in (0, 1))
+    return np.concatenate([np.zeros(0, np.int64), *parts])
 
 
 def _differences(d, opaque, axis):

@@ -3,7 +3,8 @@
 Source: the paper on spatial patches, section 3. Kernels: kernels/render/*patch*.cl, kernels/common/patch.clh.
 """
 
-from dataclasses import dataclass
+import weakref
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
+from .patch_lattice import CELLS, tile_lattice
 from .shade import Look, Shading, to_linear
 from .tiles import BIN, Grid, Scratch, view_floats
 
@@ -42,6 +44,14 @@ class PatchUpload:
     origin: NDArray  # (3,) float64
     center: NDArray  # (3,) float64, relative to origin
     reach: float  # everything lies within this of `center`
+    surface: weakref.ref  # for what only some modes need: a strong one would keep the surface for ever
+    made: dict = field(default_factory=dict)
+
+    def once(self, name: str, make):
+        """Return ``make(surface)``, called the first time that a frame needs it."""
+        if name not in self.made:
+            self.made[name] = make(self.surface())
+        return self.made[name]
 
 
 def patch_constants(upload: PatchUpload) -> dict[str, int]:
@@ -86,7 +96,7 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
     color = None if surface.color is None else to_linear(surface.color / 255)
     return PatchUpload(p, channels, precise, frames, sizes, offsets, heights, colors, cells, borders, slopes,
                        device.upload(to_linear(np.arange(256) / 255).astype(np.float32)), color, largest, spacing,
-                       surface.origin, center, reach)
+                       surface.origin, center, reach, weakref.ref(surface))
 
 
 def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, shading: Shading) -> NDArray:
@@ -140,4 +150,10 @@ def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUplo
         return
     view = device.upload(place_patches(upload, matrix, camera, grid.size, look.shading))
     records, rectangles = project_patches(device, scratch, upload, view)
-    tile_patches(device, scratch, grid, upload, view, records, rectangles, number, look)
+    if look.patches.cells in CELLS:
+        constants = grid.layout.constants | patch_constants(upload)
+        if not (grid.layout.color and look.shading.model_colors):
+            constants["CHANNELS"] = 0
+        tile_lattice(device, scratch, grid, upload, constants, view, records, rectangles, number, look.patches)
+    else:
+        tile_patches(device, scratch, grid, upload, view, records, rectangles, number, look)
