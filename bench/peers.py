@@ -50,6 +50,8 @@ class VtkWindow:
         data.SetPolys(cells)
         if mesh.normals is not None:
             data.GetPointData().SetNormals(numpy_to_vtk(np.array(mesh.normals), deep=True))
+        if mesh.colors is not None:
+            data.GetPointData().SetScalars(numpy_to_vtk(np.ascontiguousarray(mesh.colors[:, :3]), deep=True))
         mapper, actor, self.renderer = module.vtkPolyDataMapper(), module.vtkActor(), module.vtkRenderer()
         mapper.SetInputData(data)
         actor.SetMapper(mapper)

@@ -108,7 +108,7 @@ def frames(cases, surfaces, device, count: int, with_peers: bool = True) -> dict
     """
     orbits = {case.name: case.cameras(count + WARM) for case in cases}
     runners = {case.name: _clsurf_runner(case, surfaces[case.scene, case.degree], device) for case in cases}
-    seconds, cores = _in_turns(runners, orbits, count)
+    seconds, cores = in_turns(runners, orbits, count)
     found = {name: {"frame": record.timing(seconds[name]), "cores": cores[name]} for name in runners}
     if not with_peers:
         return found
@@ -122,7 +122,7 @@ def frames(cases, surfaces, device, count: int, with_peers: bool = True) -> dict
         if window is not None:
             runners[case.name, "vtk"] = _peer_runner(window, case.size)
             closers.append(window)
-    seconds, _ = _in_turns(runners, orbits, count)
+    seconds, _ = in_turns(runners, orbits, count)
     for window in closers:
         window.close()
     for case in plain:
@@ -135,7 +135,7 @@ def frames(cases, surfaces, device, count: int, with_peers: bool = True) -> dict
     return found
 
 
-def _in_turns(runners, orbits, count: int) -> tuple[dict, dict]:
+def in_turns(runners, orbits, count: int) -> tuple[dict, dict]:
     """Return the seconds of `count` runs of each runner, taken in blocks by turns, and the cores that it kept busy.
 
     A key of `runners` is a case's name, or that and a peer's.
