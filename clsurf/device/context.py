@@ -140,6 +140,12 @@ class Device:
         if self.pool is not None and is_aligned(array):
             flags = cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR
             return DeviceArray(cl.Buffer(self.context, flags, hostbuf=array), array.shape, array.dtype, array)
+        if self.pool is not None and array.nbytes:
+            # Filled before the device knows of it: a copy in the queue would wait for every launch before it.
+            block = self.pool.take(array.nbytes).view(array.dtype).reshape(array.shape)
+            block[...] = array
+            flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+            return DeviceArray(cl.Buffer(self.context, flags, hostbuf=block), array.shape, array.dtype, block)
         out = self.empty(array.shape, array.dtype)
         self.write(out, array)
         return out

@@ -13,6 +13,7 @@ CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np
             "id": (0, np.int32), "count": (0, np.int32), "level": (0, np.int32), "cost": (0, np.int32)}
 KINDS = {"headlight": 0, "directional": 1, "point": 2}
 LOOKS = ("phong", "flat", "ball_size", "ball_level")
+STREAMED_BYTES = 24 << 20  # pictures larger than this are stored past the caches
 SPAN = 128  # pixels of a row of bins that one work-item shades
 
 
@@ -130,6 +131,13 @@ def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
     return out
 
 
+def shade_constants(grid: Grid, lit: bool, channels) -> dict[str, int]:
+    """Return the constants of kernels/render/shade.clh."""
+    pixels = sum(max(CHANNELS[name][0], 1) for name in channels) * grid.size[0] * grid.size[1]
+    return {f"WRITE_{name.upper()}": name in channels for name in ("color", "depth", "normal", "position", "cost")} | {
+        "LIT": lit, "STREAMED": 4 * pixels > STREAMED_BYTES}
+
+
 def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps: DeviceArray, lit: bool,
           channels) -> dict[str, DeviceArray]:
     """Write the channels of the picture from the grid's planes; return them by name, on the device."""
@@ -138,8 +146,7 @@ def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps
     for name in channels:
         parts, dtype = CHANNELS[name]
         out[name] = device.empty((height, width, parts) if parts else (height, width), dtype)
-    constants = grid.layout.constants | {"VW": scratch.lanes, "LIT": lit, "SPAN": SPAN}
-    constants |= {f"WRITE_{name.upper()}": name in out for name in ("color", "depth", "normal", "position", "cost")}
+    constants = grid.layout.constants | {"VW": scratch.lanes, "SPAN": SPAN} | shade_constants(grid, lit, channels)
     items = (width, height) if scratch.lanes == 1 else (-(-width // SPAN), -(-height // BIN))
     unused = scratch.array("unused", (4,), np.float32)
     device.kernel("render/shade.cl", constants=constants)(
