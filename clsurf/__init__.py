@@ -17,6 +17,7 @@ from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
 from .render.scene import Scene
 from .render.shade import Shading
+from .report.page import report
 from .surface.cloud import PointCloud
 from .surface.mesh import Mesh
 from .surface.patch import PatchSurface
@@ -30,5 +31,5 @@ __all__ = [
     "Camera", "Device", "Error", "Frame", "Mesh", "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "Profile",
     "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading", "SlimSurface", "build_patches",
     "build_slim", "errors", "estimate_normals", "load", "load_frames", "models", "open_device", "project", "render",
-    "save",
+    "report", "save",
 ]

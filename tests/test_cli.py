@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import clsurf
-from clsurf.cli import main, parsed_size
+from clsurf.cli import main
+from clsurf.cli.common import parsed_size
 
-COMMANDS = ["demo", "devices", "doctor", "info", "build", "convert", "render", "bench"]
+COMMANDS = ["demo", "devices", "doctor", "info", "build", "convert", "render", "report", "bench"]
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..render.camera import Camera, Projection
+from ..render.normal_table import NormalStatistics, normal_statistics
 from ..surface.patch import PatchSurface, facet_cones, opaque_nodes
 from ..surface.placed import Placed
 from .operations import Operations, counted_operations
@@ -37,6 +38,7 @@ class PatchStatistics:
     lines: int  # scan lines of the triangles of the touched cells
     pixels: float  # area of the touched cells inside the picture, each cell by itself
     operations: dict[str, Operations]  # by mode
+    normals: NormalStatistics  # of the visible patches
 
     @property
     def plain_share(self) -> float:
@@ -99,7 +101,8 @@ def patch_statistics(surface: PatchSurface | Placed, camera: Camera, size: tuple
         cell_levels=tuple(int(v) for v in np.trim_zeros(totals.levels, "b")), parts=totals.parts, lines=totals.lines,
         pixels=totals.pixels,
         operations=counted_operations(count, totals.projected, totals.touched, totals.parts, totals.created,
-                                      totals.lines, totals.pixels))
+                                      totals.lines, totals.pixels),
+        normals=normal_statistics(view.patches, visible))
 
 
 @dataclass(eq=False)

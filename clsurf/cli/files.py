@@ -1,0 +1,125 @@
+"""Commands from file to file: `info`, `build`, `convert`."""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import InputError
+from .common import DeviceOption, QuietOption, Steps, checked_out
+from .recipe import (
+    DegreeOption,
+    ErrorOption,
+    KindOption,
+    MethodOption,
+    NodesOption,
+    PatchesOption,
+    PreciseOption,
+    SpacingOption,
+    ViewsOption,
+    recipe,
+)
+
+
+def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")]):
+    """Say what a file holds: counts, bytes, bounds."""
+    import clsurf
+    thing = clsurf.load(path)
+    print(thing)
+    low, high = thing.bounds
+    print("bounds   " + " to ".join("[" + ", ".join(f"{v:.10g}" for v in corner) + "]" for corner in (low, high)))
+    if isinstance(thing, clsurf.SlimSurface):
+        _about_slim(thing)
+    elif isinstance(thing, clsurf.PatchSurface):
+        _about_patches(thing)
+    elif hasattr(thing, "images"):
+        for i, image in enumerate(thing.images):
+            print(f"image {i:<3}{image}")
+    else:
+        print("points   " + ", ".join(f"{name} {'yes' if getattr(thing, name, None) is not None else 'no'}"
+                                      for name in ("normals", "colors")))
+
+
+def _about_slim(surface) -> None:
+    from ..surface.slim import FLOATS
+    leaves = int(surface.leaf.sum())
+    print(f"surfels  {len(surface):,}, of which {leaves:,} leaves on {int(surface.level.max(initial=0))} levels, "
+          f"{len(surface.children):,} links")
+    print(f"floats   {FLOATS[surface.degree] * leaves:,} in the leaves, {FLOATS[surface.degree]} a surfel")
+    error = "T_MDL not stored" if math.isnan(surface.error) else f"T_MDL {surface.error:g}"
+    print(f"error    {error}, diagonal {surface.diagonal:g}; bound {_bound(surface)}")
+
+
+def _about_patches(surface) -> None:
+    import numpy as np
+    sizes, counts = np.unique(surface.size, axis=0, return_counts=True)
+    sizes = [f"{count:,} of {m} x {n}" for (m, n), count in zip(sizes, counts, strict=True)]
+    print(f"patches  {len(surface):,}: " + ", ".join(sizes[:6] + ["..."] * (len(sizes) > 6)))
+    opaque = int(surface.opaque.sum())
+    colors = "one" if surface.color is not None else "no" if surface.colors is None else "yes"
+    print(f"nodes    {surface.node_count:,}, of which {opaque:,} opaque ({opaque / max(surface.node_count, 1):.1%}), "
+          f"colors {colors}, {8 * surface.displacements.itemsize}-bit displacements")
+    if len(surface):
+        steps = np.linalg.norm(np.concatenate([surface.axis_x, surface.axis_y]).astype(np.float64), axis=1)
+        print(f"spacing  {np.median(steps):.4g} ({steps.min():.4g} to {steps.max():.4g}), displacement step "
+              f"{np.median(surface.axis_z_length):.3g}")
+    print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")
+
+
+def _bound(surface) -> str:
+    return "not stored" if math.isnan(surface.bound) else \
+        f"{surface.bound:g} for {surface.bound_share:.1%} of the scan's points"
+
+
+def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB XYZ PTS CSV NPY LAS LAZ, or range "
+                                               "images: CONF, a folder of depth and colour frames.")],
+          out: Annotated[Path, typer.Argument(help="The surface to write: .clsurf, or for slim .slim2t.")],
+          kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
+          spacing: SpacingOption = None, nodes: NodesOption = "", method: MethodOption = "", views: ViewsOption = None,
+          precise: PreciseOption = False, device: DeviceOption = "", quiet: QuietOption = False):
+    """Turn a scan into a surface: SLIM surfels or spatial patches."""
+    import clsurf
+    steps = Steps(quiet)
+    how = recipe(kind, degree, error, patches=patches, spacing=spacing, nodes=nodes, method=method, views=views,
+                 precise=precise)
+    checked_out(out, (".clsurf",) if how.kind == "patches" else (".clsurf", ".slim2t"))
+    with steps.step("load"):
+        loaded = clsurf.load(scan)
+    steps.say(f"  {loaded}")
+    if isinstance(loaded, clsurf.SlimSurface | clsurf.PatchSurface):
+        raise InputError(f"{scan}: expected a scan, got a surface ({type(loaded).__name__})")
+    if how.kind_for(loaded) == "patches":
+        checked_out(out, (".clsurf",))
+    with steps.step("build"):
+        surface = how.build(loaded, device or None, steps)
+    steps.say(f"  {surface}")
+    if not math.isnan(surface.bound):
+        steps.say(f"  within {surface.bound:g} of {surface.bound_share:.1%} of the scan's points")
+    with steps.step("save"):
+        clsurf.save(surface, out)
+    steps.say(f"surface: {out.resolve()}")
+
+
+def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")],
+            out: Annotated[Path, typer.Argument(help="The file to write; its ending chooses the format. Patches "
+                                                "become their nodes, joined by two triangles a cell where the format "
+                                                "has faces.")],
+            quiet: QuietOption = False):
+    """Write a scan or a surface in another format."""
+    import clsurf
+
+    from ..io.dispatch import WRITES
+    from ..io.scans import WRITES as SCANS
+    from ..surface.patch_mesh import patch_mesh
+    steps = Steps(quiet)
+    checked_out(out, WRITES)
+    with steps.step("load"):
+        thing = clsurf.load(source)
+    steps.say(f"  {thing}")
+    if isinstance(thing, clsurf.PatchSurface) and out.suffix.lower() in SCANS:
+        thing = patch_mesh(thing)
+        steps.say(f"  {thing}")
+    with steps.step("save"):
+        clsurf.save(thing, out)
+    steps.say(f"written: {out.resolve()}")

@@ -1,0 +1,140 @@
+"""Commands that draw: `demo`, `render`, `report`."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import InputError
+from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
+from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
+from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
+
+SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
+LodOption = Annotated[float, typer.Option(help="slim: projected diameter in pixels below which coarser surfels serve; "
+                                          "8 is the fast mode, 0 draws leaves only.")]
+NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, exact, trilinear or homogeneous.")]
+CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
+AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, fading out.")]
+SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
+LookOption = Annotated[str, typer.Option(help="phong, flat; slim: ball_size, ball_level.")]
+
+
+def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg, .exr.")] = Path("clsurf-demo.png"),
+         size: SizeOption = "1024x768",
+         error: Annotated[str, typer.Option(help="T_MDL relative to the diagonal, or 'auto': from the scan's "
+                                                 "noise.")] = "0.01",
+         degree: Annotated[int, typer.Option(min=1, max=3, help="Degree of the surfels: 1, 2 or 3.")] = 2,
+         device: DeviceOption = "", quiet: QuietOption = False):
+    """Make a scan, build its surface, draw it, and say where the picture is and how long each step took."""
+    import clsurf
+    steps, start = Steps(quiet), time.perf_counter()
+    picture_size, t_mdl = parsed_size(size), parsed_error(error)
+    checked_out(out, PICTURES)
+    with steps.step("open the device"):
+        chosen = clsurf.open_device(device or None)
+    steps.say(f"  {chosen.name} ({chosen.platform_name})")
+    with steps.step("make a scan"):
+        scan = clsurf.models.demo_scan()
+    steps.say(f"  {scan}")
+    with steps.step("build the surface"):
+        surface = clsurf.build_slim(scan, degree=degree, error=t_mdl, device=chosen, progress=steps.progress)
+    steps.say(f"  {surface}")
+    camera = clsurf.Camera.framing(surface, aspect=picture_size[0] / picture_size[1])
+    with steps.step("draw it"):
+        frame = clsurf.render(surface, camera, picture_size, device=chosen)
+    with steps.step("draw it again (kernels are ready)"):
+        frame = clsurf.render(surface, camera, picture_size, device=chosen)
+    with steps.step("write the picture"):
+        frame.save(out)
+    steps.say(f"picture: {out.resolve()} ({picture_size[0]} x {picture_size[1]}), all in "
+              f"{time.perf_counter() - start:.1f} s")
+    if quiet:
+        print(out.resolve())
+
+
+def render(source: SourceArgument,
+           out: Annotated[Path, typer.Argument(help="Picture: .png, .jpg, or .exr with every channel.")],
+           size: SizeOption = "1024x768", direction: DirectionOption = "", up: UpOption = "0,1,0",
+           fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
+           channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id; .png and "
+                                                      ".jpg show color.")] = "color,depth,normal",
+           shading: LookOption = "phong", supersampling: SamplesOption = 1, lod: LodOption = 4.0,
+           nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
+           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
+           spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
+           quiet: QuietOption = False):
+    """Draw a surface or a scan into a picture."""
+    import clsurf
+
+    from ..device import Profile
+    from ..render.average import checked_supersampling
+    from ..render.renderer import checked_channels, checked_lod, checked_size
+    # Every option is checked before the work.
+    steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
+    wanted = checked_channels(filter(None, channels.split(",")))
+    checked_out(out, PICTURES)
+    if out.suffix.lower() != ".exr" and "color" not in wanted:
+        raise InputError(f"channels: expected color among them for a {out.suffix} picture, got {channels}: add it, or "
+                         "write .exr")
+    view = checked_view(direction, up, fov, eye, target, ortho)
+    how = recipe(kind, degree, error, patches=patches, spacing=spacing)
+    looks, lod, drawing = clsurf.Shading(look=shading), checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    checked_supersampling(supersampling)
+    chosen = clsurf.open_device(device or None)
+    thing = loaded_surface(source, how, chosen, steps)
+    camera = view.camera(thing, picture_size)
+    chosen.profile = Profile() if profile else None
+    with steps.step("draw"):
+        frame = clsurf.render(thing, camera, picture_size, wanted, looks, lod, device=chosen,
+                              supersampling=supersampling, patches=drawing)
+    if profile:
+        print(chosen.profile)
+        chosen.profile = None
+    with steps.step("write"):
+        frame.save(out)
+    steps.say(f"picture: {out.resolve()}")
+
+
+def report(source: SourceArgument,
+           out: Annotated[Path, typer.Option("--out", "-o", help="The page to write: .html.")] = Path("report.html"),
+           size: SizeOption = "500x500", direction: DirectionOption = "", up: UpOption = "0,1,0",
+           fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
+           lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
+           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
+           spacing: SpacingOption = None, device: DeviceOption = "", quiet: QuietOption = False):
+    """Write one HTML page about a surface and a view of it: counts, operations, times, the picture."""
+    import clsurf
+
+    from ..render.renderer import checked_lod, checked_size
+    steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
+    checked_out(out, (".html", ".htm"))
+    view = checked_view(direction, up, fov, eye, target, ortho)
+    how = recipe(kind, degree, error, patches=patches, spacing=spacing)
+    lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    chosen = clsurf.open_device(device or None)
+    thing = loaded_surface(source, how, chosen, steps)
+    with steps.step("report"):
+        clsurf.report(thing, out, view.camera(thing, picture_size), picture_size, title=source.name, lod=lod,
+                      patches=drawing, device=chosen)
+    steps.say(f"page: {out.resolve()}")
+
+
+def loaded_surface(source: Path, how: Recipe, device, steps: Steps):
+    """Return the surface in the file `source`, or the one built from the scan in it."""
+    import clsurf
+    with steps.step("load"):
+        thing = clsurf.load(source)
+    steps.say(f"  {thing}")
+    if not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
+        with steps.step("build"):
+            thing = how.build(thing, device, steps)
+        steps.say(f"  {thing}")
+    return thing
+
+
+def checked_drawing(nodes: str, cells: str, alpha: bool):
+    """Return how patches are drawn, or raise InputError."""
+    from ..render.patch_drawing import PatchDrawing
+    return PatchDrawing(nodes=nodes, cells=cells, alpha=alpha)
