@@ -23,7 +23,8 @@ def node_twists(surface: PatchSurface) -> NDArray:
 
 
 def tile_lattice(device: Device, scratch: Scratch, grid: Grid, upload, constants: dict, view: DeviceArray,
-                 records: DeviceArray, rectangles: DeviceArray, number: int, drawing) -> None:
+                 records: DeviceArray, rectangles: DeviceArray, lit: DeviceArray | None,
+                 number: int, drawing) -> None:
     """Draw the patches of every tile into its planes by subdividing their cells.
 
     Parameters
@@ -31,6 +32,8 @@ def tile_lattice(device: Device, scratch: Scratch, grid: Grid, upload, constants
     upload : PatchUpload
     constants : dict
         Those of the grid's layout and of the patches' nodes.
+    lit : (N, 4) float32, optional
+        Lit colours of the nodes, in place of unlit ones.
     number : int
         The surface's place in the scene.
     drawing : PatchDrawing
@@ -42,10 +45,10 @@ def tile_lattice(device: Device, scratch: Scratch, grid: Grid, upload, constants
         twists = upload.once("twists", lambda surface: device.upload(node_twists(surface)))
     slots = scratch.array("patch_slots", (grid.tile_count, tile * tile, 2), np.uint32)
     constants = constants | {"VW": lanes, "TILE_BINS": grid.tile_bins, "SMOOTH": smooth,
-                             "SMOOTH_NORMALS": drawing.normals == "smooth"}
+                             "SMOOTH_NORMALS": drawing.normals == "smooth", "LIT_NODES": lit is not None}
     group = 64 if lanes == 1 else 1
     device.kernel("render/tile_lattice.cl", constants=constants)(
         (grid.tile_count * group,), (group,), view, rectangles, records, upload.sizes, upload.offsets, upload.count,
         upload.heights, upload.cells, upload.borders, upload.slopes, twists, upload.cells, upload.colors,
-        upload.linear, upload.linear, number, grid.tiles_x, grid.tile_count, grid.bins_x, grid.bins_y, slots,
-        grid.touched, grid.planes)
+        upload.linear, upload.linear if lit is None else lit, number, grid.tiles_x, grid.tile_count, grid.bins_x,
+        grid.bins_y, slots, grid.touched, grid.planes)

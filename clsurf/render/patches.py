@@ -13,6 +13,7 @@ from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
 from .patch_lattice import CELLS, tile_lattice
+from .patch_nodes import light_nodes
 from .shade import Look, Shading, to_linear
 from .tiles import BIN, Grid, Scratch, view_floats
 
@@ -150,10 +151,13 @@ def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUplo
         return
     view = device.upload(place_patches(upload, matrix, camera, grid.size, look.shading))
     records, rectangles = project_patches(device, scratch, upload, view)
+    constants = grid.layout.constants | patch_constants(upload)
+    if not (grid.layout.color and look.shading.model_colors):
+        constants["CHANNELS"] = 0
+    lit = None
+    if grid.layout.lit:
+        lit = light_nodes(device, scratch, upload, constants, view, look.lamps, rectangles, upload.slopes)
     if look.patches.cells in CELLS:
-        constants = grid.layout.constants | patch_constants(upload)
-        if not (grid.layout.color and look.shading.model_colors):
-            constants["CHANNELS"] = 0
-        tile_lattice(device, scratch, grid, upload, constants, view, records, rectangles, number, look.patches)
+        tile_lattice(device, scratch, grid, upload, constants, view, records, rectangles, lit, number, look.patches)
     else:
         tile_patches(device, scratch, grid, upload, view, records, rectangles, number, look)

@@ -115,11 +115,12 @@ class Renderer:
         own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
         try:
             # The stages of a frame.
-            grid = self._new_grid(scene, size, channels, shading)
+            grid = self._new_grid(scene, size, channels, shading, patches)
+            lamps = self.device.upload(shading_floats(shading, scene.lights, background, camera))
             for number, (surface, matrix) in enumerate(scene.placed):
-                self._draw(grid, number, surface, matrix, camera, Look(shading, lod, patches))
+                self._draw(grid, number, surface, matrix, camera, Look(shading, lod, patches, lamps))
             origin = scene_origin(scene)
-            arrays = self._shade(grid, camera, origin, scene.lights, shading, background, channels)
+            arrays = self._shade(grid, camera, origin, lamps, shading, channels)
             if factor > 1:
                 arrays = average(self.device, arrays, picture, factor, wanted, self._scratch.lanes)
             return Frame({name: self.device.download(array, copy=False) for name, array in arrays.items()}, origin,
@@ -131,13 +132,16 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, scene, size, channels, shading) -> Grid:
+    def _new_grid(self, scene, size, channels, shading, patches) -> Grid:
         """Return bins that nothing has touched yet."""
         colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
                                                for s, _ in scene.placed)
         colored |= shading.look.startswith("ball")
-        layout = Layout(color=colored and "color" in channels, id="id" in channels, count="count" in channels,
-                        level="level" in channels)
+        # Gouraud shading puts light into the planes' colours.
+        lit = patches.shading == "gouraud" and shading.look != "flat" and "color" in channels
+        lit &= any(isinstance(s, PatchSurface) for s, _ in scene.placed)
+        layout = Layout(color=(colored or lit) and "color" in channels, id="id" in channels, count="count" in channels,
+                        level="level" in channels, lit=lit)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins,
@@ -154,10 +158,9 @@ class Renderer:
             upload = self._uploads[surface] = put(self.device, surface)
         draw(self.device, self._scratch, grid, upload, matrix, camera, look, number)
 
-    def _shade(self, grid, camera, origin, lights, shading, background, channels):
+    def _shade(self, grid, camera, origin, lamps, shading, channels):
         offset = camera.eye - origin
         view = self.device.upload(view_floats(camera, grid.size, offset=offset))
-        lamps = self.device.upload(shading_floats(shading, lights, background, camera))
         return shade(self.device, self._scratch, grid, view, lamps, shading.look != "flat", channels)
 
     def close(self) -> None:

@@ -99,6 +99,7 @@ class Look:
     shading: Shading
     lod: float
     patches: PatchDrawing
+    lamps: DeviceArray  # the shading buffer, for what is lit before the last stage
 
 
 def to_linear(srgb):

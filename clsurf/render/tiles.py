@@ -25,6 +25,7 @@ class Layout:
     id: bool = False
     count: bool = False
     level: bool = False
+    lit: bool = False  # some colours are lit already
 
     @property
     def constants(self) -> dict[str, int]:
@@ -33,7 +34,7 @@ class Layout:
         for name, planes in (("color", 3), ("id", 1), ("count", 1), ("level", 1)):
             out[f"FIELD_{name.upper()}"] = at if getattr(self, name) else -1
             at += planes if getattr(self, name) else 0
-        return out | {"FIELDS": at}
+        return out | {"FIELDS": at, "LIT_COLORS": self.lit}
 
 
 @dataclass(frozen=True, eq=False)
