@@ -1,74 +1,298 @@
-"""Spatial patches from triangle meshes."""
+"""Spatial patches from triangle meshes: areas of the mesh, a frame around each, its faces resampled onto the nodes.
+
+Source: the paper on spatial patches, section 4.1.
+"""
+
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..errors import InputError
+from ..io.cleaning import first_of_duplicates
 from ..surface.mesh import Mesh
-from . import segments
+from ..surface.patch import PatchSurface
+from .patch_error import patch_distances
 from .quantize import quantized
-from .resample import Frames, area_lists, resample_faces
+from .resample import REACH, Frames, area_lists, resample_faces
+from .segments import FaceGraph, face_graph, partition, split_faces
 
-ANGLES = 12
+NODES_A_VERTEX = 441_014 / 34_834  # of the paper's bunny (Table 1): the mesh's own resolution
+ANGLES = 12  # within 90 degrees, that rectangles around areas are tried at
+LONGEST_EDGE = 0.5  # of a patch's width: larger faces are cut, so that areas can end within them
+WIDEST = 0.95  # of what a patch spans: widths along segments.DIRECTIONS fall short of those of the rectangle
+BOUND_SHARE = 0.999  # of the mesh's vertices lie within `bound` of the patches
+BOUND_SAMPLES = 1 << 16
+MOST_PATCHES = 2_000_000  # that a search for an error tries
+SEARCH_STEPS = 8
 
 
-def frames_of_areas(vertices, graph, owner, count, size, reach, angles=ANGLES, square=True):
-    """Rectangles around areas."""
-    normal = np.stack([np.bincount(owner, graph.area * graph.normal[:, k], count) for k in range(3)], axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    # axes
-    s = np.where(normal[:, 2] < 0, -1.0, 1.0)
-    a = -1 / (s + normal[:, 2]); b = normal[:, 0] * normal[:, 1] * a
-    u = np.stack([1 + s * normal[:, 0] ** 2 * a, s * b, -s * normal[:, 0]], 1)
-    v = np.stack([b, s + normal[:, 1] ** 2 * a, -normal[:, 1]], 1)
-    key = np.unique((owner[:, None] * np.int64(len(vertices)) + graph.corners).ravel())
-    area, vertex = np.divmod(key, len(vertices))
+@dataclass(frozen=True)
+class Conversion:
+    """Patches of a mesh, and the area that every face went into."""
+
+    surface: PatchSurface
+    graph: FaceGraph
+    owner: NDArray  # (f,) int64
+
+
+def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
+    """Return the patches of a mesh: exactly `request.patches`, or of `request.spacing`, or as good as `request.error`.
+
+    With none of them the number of nodes goes with that of vertices, as in the paper's Table 1; more patches are made
+    where cones, creases and separate parts of the mesh ask for them.
+
+    Raises
+    ------
+    InputError
+        A mesh without usable faces or without extent, or a request that cannot be met.
+    """
+    usable = np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all(axis=1)
+    if not usable.any():
+        raise InputError("scan: expected a mesh with faces, got none with finite corners: points need method='local'")
+    if not usable.all():
+        mesh = _with_faces(mesh, mesh.faces[usable], np.flatnonzero(usable))
+    used = mesh.vertices[mesh.faces.ravel()]
+    diagonal = float(np.linalg.norm(np.ptp(used, axis=0).astype(np.float64)))
+    if not diagonal > 0:
+        raise InputError("scan: expected a mesh with some extent, got all corners at one place")
+    if request.error is None:
+        found = converted(mesh, request, device, progress)
+    else:
+        found = _searched(mesh, request, device, progress, diagonal)
+    return _with_bound(found, diagonal)
+
+
+def converted(mesh: Mesh, request, device, progress) -> Conversion:
+    """Convert `mesh` with a number of patches or a spacing given, or neither."""
+    m, n = request.nodes
+    spans = np.array([m, n]) - 1 - 2 * (REACH - 1)
+    area = _doubled_areas(mesh).sum() / 2
+    count = request.patches or max(1, round(len(mesh.vertices) * NODES_A_VERTEX / (m * n)))
+    width = request.spacing * spans.min() if request.spacing else math.sqrt(area / count)
+    if request.spacing:
+        count = max(1, int(area / width ** 2))
+    progress(0.0, "areas")
+    mesh, corners, vertices = _prepared(mesh, LONGEST_EDGE * width if width > 0 else np.inf)
+    graph = face_graph(vertices, corners)
+    if request.patches:
+        _check_count(graph, request.patches)
+    widest = WIDEST * width if request.spacing else np.inf
+    owner, count = partition(graph, 1 if request.spacing else count, widest, exact=bool(request.patches),
+                             step=lambda: progress(0.5, "areas"))
+    frames, owner = framed(graph, owner, count, request.nodes, request.spacing)
+    progress(0.0, "nodes")
+    heights, colors, _ = resample_faces(device, mesh, frames, area_lists(owner, len(frames), corners), request.precise)
+    surface = quantized(frames.origins, frames.axis_x, frames.axis_y, heights, frames.size, colors, request.precise,
+                        origin=mesh.origin)
+    progress(1.0, "nodes")
+    return Conversion(surface, graph, owner)
+
+
+def _check_count(graph: FaceGraph, patches: int) -> None:
+    parts = graph.components[0]
+    if not parts <= patches <= len(graph):
+        raise InputError(f"patches: expected from {parts:,} (the separate parts of the mesh) to {len(graph):,} (its "
+                         f"faces), got {patches:,}")
+
+
+# The mesh -----------------------------------------------------------------------------------------------------------
+
+
+def _prepared(mesh: Mesh, longest: float) -> tuple[Mesh, NDArray, NDArray]:
+    """Return the mesh with long edges cut, its faces over welded vertices, and these in float64."""
+    v = mesh.vertices.astype(np.float64)
+    edge = v[mesh.faces] - v[mesh.faces[:, [1, 2, 0]]]
+    if np.einsum("fij,fij->fi", edge, edge).max() > longest ** 2:
+        faces, ends, source = split_faces(mesh.faces, v, longest)
+        mesh = _with_faces(_with_midpoints(mesh, ends), faces, source)
+    first, target = first_of_duplicates(mesh.vertices)
+    return mesh, target[mesh.faces], mesh.vertices[first].astype(np.float64)
+
+
+def _with_faces(mesh: Mesh, faces: NDArray, source: NDArray) -> Mesh:
+    """Return the mesh with other faces; colours of faces come from the old faces `source`."""
+    kept = {}
+    if "face_colors" in mesh.attributes:
+        kept["face_colors"] = np.asarray(mesh.attributes["face_colors"])[source]
+    return replace(mesh, faces=faces, attributes=kept)
+
+
+def _with_midpoints(mesh: Mesh, ends: list[NDArray]) -> Mesh:
+    """Return the mesh with vertices added halfway between the pairs `ends`."""
+    v, colors, uv = mesh.vertices.astype(np.float64), mesh.colors, mesh.uv
+    for pair in ends:
+        v = np.concatenate([v, v[pair].mean(axis=1)])
+        if colors is not None:
+            colors = np.concatenate([colors, np.rint(colors[pair].mean(axis=1)).astype(np.uint8)])
+        if uv is not None:
+            uv = np.concatenate([uv, uv[pair].mean(axis=1)])
+    return replace(mesh, vertices=v.astype(np.float32), normals=None, colors=colors, uv=uv)
+
+
+def _doubled_areas(mesh: Mesh) -> NDArray:
+    v = mesh.vertices.astype(np.float64)[mesh.faces]
+    return np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]), axis=1)
+
+
+# Frames -------------------------------------------------------------------------------------------------------------
+
+
+def framed(graph: FaceGraph, owner: NDArray, count: int, nodes, spacing: float | None = None):
+    """Return the frames of areas: the rectangle of least spacing among `ANGLES`, z along the area's mean normal.
+
+    With `spacing` given, every frame has it, and areas that their patch does not span are halved until it does.
+
+    Returns
+    -------
+    frames : Frames
+        Square cells; relative to the zero of the graph's vertices.
+    owner : (f,) int64
+    """
+    spans = np.asarray(nodes) - 1 - 2 * (REACH - 1)
+    normal = graph.normals_of(owner, count)
+    box = _rectangles(graph, owner, count, normal, spans)
+    while spacing is not None:
+        large = np.flatnonzero((box.high - box.low > spans * spacing * (1 + 1e-9)).any(axis=1))
+        halved, more = _halved(graph, owner, count, large, box)
+        if more == count:
+            break
+        owner, count = halved, more
+        normal = graph.normals_of(owner, count)
+        box = _rectangles(graph, owner, count, normal, spans)
+    step = ((box.high - box.low) / spans).max(axis=1)
+    least = max(np.ptp(graph.vertices, axis=0).max() * 1e-6, 1e-30)  # an area of one face without extent
+    step = np.full(count, spacing, np.float64) if spacing is not None else np.maximum(step, least)
+    corner = (box.low + box.high) / 2 - step[:, None] * (np.asarray(nodes) - 1) / 2
+    origins = corner[:, :1] * box.axis_x + corner[:, 1:] * box.axis_y + box.height[:, None] * normal
+    return Frames(origins, box.axis_x * step[:, None], box.axis_y * step[:, None],
+                  np.broadcast_to(np.asarray(nodes, np.int32), (count, 2))), owner
+
+
+@dataclass(frozen=True)
+class Rectangles:
+    """Rectangles around areas, in the planes of their normals."""
+
+    axis_x: NDArray  # (p, 3) float64, unit
+    axis_y: NDArray  # (p, 3) float64, unit
+    low: NDArray  # (p, 2) float64: least x and y of the area's vertices
+    high: NDArray  # (p, 2) float64
+    height: NDArray  # (p,) float64: mean of the area along its normal
+
+
+def _rectangles(graph, owner, count, normal, spans) -> Rectangles:
+    """Return for every area the rectangle that asks for the least spacing."""
+    sign = np.where(normal[:, 2] < 0, -1.0, 1.0)
+    a = -1 / (sign + normal[:, 2])
+    b = normal[:, 0] * normal[:, 1] * a
+    u = np.stack([1 + sign * normal[:, 0] ** 2 * a, sign * b, -sign * normal[:, 0]], axis=1)
+    v = np.stack([b, sign + normal[:, 1] ** 2 * a, -normal[:, 1]], axis=1)
+    key = (owner[:, None] * np.int64(len(graph.vertices)) + graph.corners).ravel()
+    key.sort()
+    area, vertex = np.divmod(key[np.append(True, key[1:] != key[:-1])], len(graph.vertices))
     starts = np.searchsorted(area, np.arange(count))
-    p = vertices[vertex]
-    x, y = np.einsum("ij,ij->i", p, u[area]), np.einsum("ij,ij->i", p, v[area])
-    best = np.full(count, np.inf)
-    out = np.zeros((count, 5))
-    n = np.asarray(size) - 1 - 2 * (reach - 1)
-    for angle in np.arange(angles) * np.pi / 2 / angles * (1 if square else 1):
-        c, si = np.cos(angle), np.sin(angle)
-        xx, yy = c * x + si * y, c * y - si * x
-        x0, x1 = np.minimum.reduceat(xx, starts), np.maximum.reduceat(xx, starts)
-        y0, y1 = np.minimum.reduceat(yy, starts), np.maximum.reduceat(yy, starts)
-        if square:
-            cost = np.maximum((x1 - x0) / n[0], (y1 - y0) / n[1])
-        else:
-            cost = (x1 - x0) * (y1 - y0)
-        better = cost < best
-        best[better] = cost[better]
-        out[better] = np.stack([np.full(count, angle), x0, x1, y0, y1], 1)[better]
-    angle, x0, x1, y0, y1 = out.T
-    c, si = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    ax, ay = c * u + si * v, c * v - si * u
-    sx, sy = (x1 - x0) / n[0], (y1 - y0) / n[1]
-    if square:
-        sx = sy = np.maximum(sx, sy)
-    low = lambda lo, hi, s, k: (lo + hi) / 2 - s * (size[k] - 1) / 2
-    ox, oy = low(x0, x1, sx, 0), low(y0, y1, sy, 1)
-    height = np.einsum("ij,ij->i", normal, np.stack([np.bincount(owner, graph.area * graph.middle[:, k], count) for k in range(3)], 1) / np.maximum(np.bincount(owner, graph.area, count), 1e-300)[:, None])
-    origin = ox[:, None] * ax + oy[:, None] * ay + height[:, None] * normal
-    return Frames(origin, ax * sx[:, None], ay * sy[:, None], np.broadcast_to(np.asarray(size, np.int32), (count, 2)))
+    place = graph.vertices[vertex]
+    x, y, z = (np.einsum("ij,ij->i", place, axis[area]) for axis in (u, v, normal))
+    best, found = np.full(count, np.inf), np.zeros((count, 5))
+    turns = ANGLES if spans[0] == spans[1] else 2 * ANGLES
+    for angle in np.arange(turns) * (np.pi / 2 / ANGLES):
+        c, s = math.cos(angle), math.sin(angle)
+        along, across = c * x + s * y, c * y - s * x
+        box = [np.minimum.reduceat(along, starts), np.maximum.reduceat(along, starts),
+               np.minimum.reduceat(across, starts), np.maximum.reduceat(across, starts)]
+        step = np.maximum((box[1] - box[0]) / spans[0], (box[3] - box[2]) / spans[1])
+        better = step < best * (1 - 1e-9)
+        best[better] = step[better]
+        found[better] = np.stack([np.full(count, angle), *box], axis=1)[better]
+    c, s = np.cos(found[:, :1]), np.sin(found[:, :1])
+    height = np.add.reduceat(z, starts) / np.diff(np.append(starts, len(z)))
+    return Rectangles(c * u + s * v, c * v - s * u, found[:, 1::2], found[:, 2::2], height)
 
 
-def convert(mesh: Mesh, request, device, progress, reach=1.25, square=True, angles=12, first=None, bw=2.0, floor=1e-3, lloyd=0, cone=60):
-    vertices = mesh.vertices.astype(np.float64)
-    graph = segments.face_graph(vertices, mesh.faces.astype(np.int64))
-    K = request.patches or 1526
-    areas = segments.Areas(graph, floor=floor)
-    areas.merge(int(K * (first or 1)), np.cos(np.radians(cone)))
-    w = segments.edge_weights(graph, bw)
-    owner, count = areas.owner, areas.count
-    for _ in range(lloyd + 1):
-        owner = segments.regrown(graph, segments.central_faces(graph, owner, count), w)
-    if first:
-        areas = segments.Areas(graph, owner, count, floor=floor)
-        areas.merge(K, np.cos(np.radians(cone)))
-        owner, count = areas.owner, areas.count
-    frames = frames_of_areas(vertices, graph, owner, count, request.nodes, reach, angles, square)
-    lists = area_lists(owner, count, graph.corners)
-    heights, colors, source = resample_faces(device, mesh, frames, lists, request.precise, reach)
-    diagonal = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
-    return quantized(frames.origins, frames.axis_x, frames.axis_y, heights, frames.size, colors, request.precise,
-                     origin=mesh.origin, diagonal=diagonal)
+def _halved(graph, owner, count, large, box: Rectangles) -> tuple[NDArray, int]:
+    """Return areas with the areas `large` cut across their longer side, and their number."""
+    if not len(large):
+        return owner, count
+    chosen = np.zeros(count, bool)
+    chosen[large] = True
+    longer = (box.high - box.low).argmax(axis=1)
+    axis = np.where(longer[:, None] == 0, box.axis_x, box.axis_y)
+    middle = ((box.low + box.high) / 2)[np.arange(count), longer]
+    faces = np.flatnonzero(chosen[owner])
+    beyond = np.einsum("ij,ij->i", graph.middle[faces], axis[owner[faces]]) > middle[owner[faces]]
+    # An area whose faces are all on one side stays as it is.
+    both = (np.bincount(owner[faces], beyond, count) > 0) & (np.bincount(owner[faces], ~beyond, count) > 0)
+    number = np.cumsum(both) - 1 + count
+    moved = faces[beyond & both[owner[faces]]]
+    out = owner.copy()
+    out[moved] = number[owner[moved]]
+    return out, count + int(np.count_nonzero(both))
+
+
+# How good it is -----------------------------------------------------------------------------------------------------
+
+
+def _face_of_vertices(graph: FaceGraph) -> NDArray:
+    """Return a face (v,) of every vertex."""
+    face = np.zeros(len(graph.vertices), np.int64)
+    face[graph.corners.ravel()] = np.repeat(np.arange(len(graph)), 3)
+    return face
+
+
+def _with_bound(found: Conversion, diagonal: float) -> PatchSurface:
+    graph = found.graph
+    chosen = np.arange(len(graph.vertices))[::max(1, len(graph.vertices) // BOUND_SAMPLES)]
+    patch = found.owner[_face_of_vertices(graph)[chosen]]
+    upper, _ = patch_distances(found.surface, patch, graph.vertices[chosen])
+    return replace(found.surface, diagonal=diagonal, bound=float(np.quantile(upper, BOUND_SHARE)),
+                   bound_share=BOUND_SHARE)
+
+
+def _rms(found: Conversion) -> float:
+    """Return the root mean square distance of the mesh from its patches, world units, by area."""
+    graph = found.graph
+    step = max(1, len(graph) // BOUND_SAMPLES)
+    faces = np.arange(len(graph))[::step]
+    total = weight = 0.0
+    for points in (graph.middle[faces], *(graph.vertices[graph.corners[faces, k]] for k in range(3))):
+        _, near = patch_distances(found.surface, found.owner[faces], points)
+        total, weight = total + (graph.area[faces] * near ** 2).sum(), weight + graph.area[faces].sum()
+    return math.sqrt(total / max(weight, 1e-300))
+
+
+def _searched(mesh, request, device, progress, diagonal) -> Conversion:
+    """Return the coarsest conversion whose root mean square distance is at most `request.error` of the diagonal."""
+    goal, tried = request.error * diagonal, {}
+    m, n = request.nodes
+    best, area = None, _doubled_areas(mesh).sum() / 2
+    spacing = math.sqrt(area / max(len(mesh.vertices) * NODES_A_VERTEX / (m * n), 1)) / (min(m, n) - 1)
+    least = math.sqrt(area / MOST_PATCHES) / (min(m, n) - 1)
+    for step in range(SEARCH_STEPS):
+        progress(step / SEARCH_STEPS, "spacing")
+        found = converted(mesh, replace(request, error=None, spacing=spacing), device, lambda *_: None)
+        rms = _rms(found)
+        tried[spacing] = rms
+        if rms <= goal and (best is None or spacing > best[0]):
+            best = spacing, found
+        if best is not None and 0.93 * goal <= tried[best[0]]:
+            break
+        spacing = max(least, _next_spacing(tried, goal))
+        if spacing in tried:
+            break
+    if best is None:
+        raise InputError(f"error: expected at least {min(tried.values()) / diagonal:.2g} of the diagonal, which the "
+                         f"finest patches tried reach, got {request.error:g}")
+    return best[1]
+
+
+def _next_spacing(tried: dict[float, float], goal: float) -> float:
+    """Return the spacing to try: between those around the goal, else carried on as its 1.5th power."""
+    good = [s for s, rms in tried.items() if rms <= goal]
+    bad = [s for s, rms in tried.items() if rms > goal]
+    if good and bad and max(good) < min(bad):
+        a, b = max(good), min(bad)
+        at = math.log(0.97 * goal / max(tried[a], 1e-300)) / math.log(tried[b] / max(tried[a], 1e-300))
+        return a * (b / a) ** min(max(at, 0.1), 0.9)
+    nearest = max(good) if good else min(bad)
+    return nearest * min(max((0.95 * goal / max(tried[nearest], 1e-300)) ** (1 / 1.5), 0.2), 5.0)

@@ -3,13 +3,17 @@
 // A patch owns the first faces of its list; the rest lie around them. A node is needed where an own face meets one of the
 // four cells around it, or comes within REACH - 1 steps of them. Its height is that of the own face above it, the highest
 // of several; beyond the own faces that of the face around which lies closest to the plane of the nearest own face, if it
-// is within GAP_LIMIT steps of it; otherwise that plane, its slope limited. Scratch: two floats a node.
+// is within GAP_LIMIT steps of it. Where there is none (at open borders and folds) the plane is carried on, but only to
+// nodes within CARRY steps of an own face. Scratch: two floats a node.
 //
 // Paper on spatial patches, section 4.1 ("can be converted to patches, since ... projected onto a plane").
 #include "build/patch_frame.clh"
 
 #ifndef REACH
 #define REACH 1.25f       // half the side of the square around a node that an own face must meet, node steps
+#endif
+#ifndef CARRY
+#define CARRY 0.8f        // the same for nodes that no face lies over
 #endif
 #ifndef SLOPE_LIMIT
 #define SLOPE_LIMIT 2.0f  // of planes that are carried on beyond their faces
@@ -19,8 +23,11 @@
 #endif
 #define FLAT_AREA 1e-9f   // a triangle seen edge-on: no plane over it
 
-#define OWN -1.0f         // ring gap of nodes under an own face
+// Gap of a node: to the plane of the nearest own face where another face was found there, or what it is.
 #define UNNEEDED -2.0f
+#define OWN -1.0f         // an own face lies over it
+#define CARRIED 1e30f     // none found, near enough to carry the plane on
+#define LOOSE 2e30f       // none found
 
 typedef struct { int i0, i1, j0, j1; } NodeBox;
 
@@ -35,13 +42,13 @@ inline NodeBox nodes_around(const FlatTriangle *t, float reach, int m, int n) {
   return box;
 }
 
-// Whether the square of half side REACH around (x, y) meets the triangle, given that it meets its box.
-inline bool meets(const FlatTriangle *t, float side, float x, float y) {
+// Whether the square of half side `reach` around (x, y) meets the triangle, given that it meets its edges' box.
+inline bool meets(const FlatTriangle *t, float side, float reach, float x, float y) {
   for (int k = 0; k < 3; k++) {
     int b = k == 2 ? 0 : k + 1;
     float dx = (t->x[b] - t->x[k]) * side, dy = (t->y[b] - t->y[k]) * side;
     float edge = dx * (y - t->y[k]) - dy * (x - t->x[k]);
-    if (edge + REACH * (fabs(dx) + fabs(dy)) < 0.0f) return false;
+    if (edge + reach * (fabs(dx) + fabs(dy)) < 0.0f) return false;
   }
   return true;
 }
@@ -85,15 +92,16 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
       for (int i = box.i0; i <= box.i1; i++) {
         int k = first + j * m + i;
         float x = i, y = j;
-        if (own ? !meets(&t, side, x, y) : distance[k] == INFINITY || gap[k] == OWN) continue;
+        if (own ? !meets(&t, side, REACH, x, y) : distance[k] == INFINITY || gap[k] == OWN) continue;
         float d2 = nearest_weights(&t, area, x, y, weight);
         if (own) {
           float z = carried_height(&t, area, x, y, weight);
+          float state = d2 == 0.0f ? OWN : d2 <= 2.0f * CARRY * CARRY && meets(&t, side, CARRY, x, y) ? CARRIED : LOOSE;
+          if (distance[k] == INFINITY || state < gap[k]) gap[k] = state;
           if (d2 > distance[k] || (d2 == distance[k] && z <= heights[k])) continue;
           distance[k] = d2;
           heights[k] = z;
           source[k] = list[at];
-          gap[k] = d2 > 0.0f ? INFINITY : OWN;
         } else if (d2 == 0.0f) {
           // heights[k] goes on holding the own plane, distance[k] takes the height found
           float z = weight[0] * t.z[0] + weight[1] * t.z[1] + weight[2] * t.z[2], miss = fabs(z - heights[k]);
@@ -104,6 +112,8 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
         }
       }
   }
-  for (int k = first; k < first + m * n; k++)
-    heights[k] = frame[FRAME_STEP] * (gap[k] >= 0.0f && gap[k] < INFINITY ? distance[k] : heights[k]);
+  for (int k = first; k < first + m * n; k++) {
+    heights[k] = gap[k] == LOOSE ? NAN : frame[FRAME_STEP] * (gap[k] >= 0.0f && gap[k] < CARRIED ? distance[k] : heights[k]);
+    if (gap[k] == LOOSE) source[k] = -1;
+  }
 }

@@ -1,0 +1,50 @@
+"""How far points of a scan lie from the patches that stand for their part of it."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..surface.patch import PatchSurface
+
+
+def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray) -> tuple[NDArray, NDArray]:
+    """Return distances from points to patches that cover them.
+
+    Parameters
+    ----------
+    patch : (n,) int
+        Patch of every point.
+    points : (n, 3) float64
+        Relative to the surface's origin.
+
+    Returns
+    -------
+    upper : (n,) float64
+        World units, never less than the distance to the surface: along the patch's z where the point's cell is opaque,
+        otherwise to the nearest opaque node.
+    near : (n,) float64
+        The first one times the cosine of the cell's slope: the distance itself, to first order.
+    """
+    x, y, z = (a.astype(np.float64) for a in (surface.axis_x, surface.axis_y, surface.axis_z))
+    apart = points - surface.origins[patch]
+    i, j, k = (np.einsum("ij,ij->i", apart, (a / np.einsum("ij,ij->i", a, a)[:, None])[patch]) for a in (x, y, z))
+    m, n = surface.size[patch].T.astype(np.int64)
+    column, row = np.clip(np.floor(i), 0, m - 2).astype(np.int64), np.clip(np.floor(j), 0, n - 2).astype(np.int64)
+    at = surface.node_offset[patch] + row * m + column
+    corners = np.stack([at, at + 1, at + m, at + m + 1])
+    inside = (i >= 0) & (i <= m - 1) & (j >= 0) & (j <= n - 1) & surface.opaque[corners].all(axis=0)
+    d = surface.displacements[corners].astype(np.float64)
+    u, v = i - column, j - row
+    miss = k - ((1 - v) * ((1 - u) * d[0] + u * d[1]) + v * ((1 - u) * d[2] + u * d[3]))
+    lengths = [np.linalg.norm(a, axis=1)[patch] for a in (x, y, z)]
+    upper = np.abs(miss) * lengths[2]
+    slope_x = ((1 - v) * (d[1] - d[0]) + v * (d[3] - d[2])) * lengths[2] / lengths[0]
+    slope_y = ((1 - u) * (d[2] - d[0]) + u * (d[3] - d[1])) * lengths[2] / lengths[1]
+    near = upper / np.sqrt(1 + slope_x ** 2 + slope_y ** 2)
+    outside = np.flatnonzero(~inside)
+    if len(outside):
+        nodes = surface.positions() - surface.origin
+        nodes = nodes[np.isfinite(nodes[:, 0])]
+        upper[outside] = cKDTree(nodes).query(points[outside])[0] if len(nodes) else np.inf
+        near[outside] = upper[outside]
+    return upper, near
