@@ -142,7 +142,7 @@ def _maps(color, elevation, spacing: float, seed: int) -> tuple[SphereMap, Spher
     if elevation is not None:
         heights = _elevation_map(elevation)
     elif color is None:
-        heights = continents(int(np.clip(2 ** np.ceil(np.log2(np.pi / pixel)), 256, 1024)), seed)
+        heights = continents(int(np.clip(2 ** np.ceil(np.log2(np.pi / spacing)), 128, 512)), seed)
     if color is not None:
         colors = _color_map(color).reduced(pixel)
         heights = heights_by_color(colors) if heights is None else heights
