@@ -4,6 +4,8 @@ Distances are exact to the triangles on the other side: a k-d tree of centroids 
 until no other triangle can be nearer. Patches are taken as they are drawn, as bilinear quads, cut into triangles.
 """
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -19,7 +21,7 @@ def triangle_distances(points: NDArray, triangles: NDArray, first: int = 8) -> N
     radius = np.linalg.norm(triangles - middle[:, None], axis=2).max(axis=1)
     best = np.full(len(points), np.inf)
     # One tree for each class of size: a few large triangles would make every search among the small ones wide.
-    level = np.ceil(np.log2(np.maximum(radius, radius.max() * 1e-6)) * 1.0).astype(int)
+    level = np.ceil(np.log2(np.maximum(radius, radius.max() * 1e-6))).astype(int)
     for size in np.unique(level):
         chosen = np.flatnonzero(level == size)
         reach = radius[chosen].max()
@@ -61,7 +63,7 @@ def point_triangle(p: NDArray, t: NDArray) -> NDArray:
 
 
 def cells(surface) -> NDArray:
-    """Return the corners (c, 4, 3) float64 of all wholly opaque cells: (i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)."""
+    """Return the corners (c, 4, 3) float64 of all wholly opaque cells, the next along x and then the next row."""
     position = surface.positions()
     patch, i, j = surface.node_patches()
     m, n = surface.size[patch].T.astype(np.int64)
@@ -83,8 +85,8 @@ def patch_triangles(surface, parts: int = PARTS) -> NDArray:
     steps = np.arange(parts + 1) / parts
     grid = {(x, y): bilinear(corners, x, y) for x in steps for y in steps}
     out = []
-    for x0, x1 in zip(steps[:-1], steps[1:], strict=True):
-        for y0, y1 in zip(steps[:-1], steps[1:], strict=True):
+    for x0, x1 in itertools.pairwise(steps):
+        for y0, y1 in itertools.pairwise(steps):
             a, b, c, d = grid[x0, y0], grid[x1, y0], grid[x0, y1], grid[x1, y1]
             out += [np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)]
     return np.concatenate(out)
@@ -119,6 +121,7 @@ def quality(surface, mesh, samples: int = SAMPLES) -> dict[str, float]:
     to_patches = triangle_distances(of_mesh, patch_triangles(surface))
     percent, rms = 100 / diagonal, lambda d: float(np.sqrt(np.mean(d ** 2)))
     there, back, at_vertices = to_mesh * percent, to_patches[:samples] * percent, to_patches[samples:] * percent
-    return {"rms": float(np.sqrt((rms(there) ** 2 + rms(back) ** 2) / 2)), "rms_surface": rms(there), "rms_mesh": rms(back),
+    both = float(np.sqrt((rms(there) ** 2 + rms(back) ** 2) / 2))
+    return {"rms": both, "rms_surface": rms(there), "rms_mesh": rms(back),
             "max_vertices": float(at_vertices.max()), "max_surface": float(there.max()), "patches": len(surface),
             "nodes": surface.node_count, "megabytes": surface.nbytes / 1e6}

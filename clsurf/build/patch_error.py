@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..surface.patch import PatchSurface
 
@@ -21,7 +20,7 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray) -> t
     -------
     upper : (n,) float64
         World units, never less than the distance to the surface: along the patch's z where the point's cell is opaque,
-        otherwise to the nearest opaque node.
+        otherwise to the patch's nearest opaque node.
     near : (n,) float64
         The first one times the cosine of the cell's slope: the distance itself, to first order.
     """
@@ -42,9 +41,19 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray) -> t
     slope_y = ((1 - u) * (d[2] - d[0]) + u * (d[3] - d[1])) * lengths[2] / lengths[1]
     near = upper / np.sqrt(1 + slope_x ** 2 + slope_y ** 2)
     outside = np.flatnonzero(~inside)
-    if len(outside):
-        nodes = surface.positions() - surface.origin
-        nodes = nodes[np.isfinite(nodes[:, 0])]
-        upper[outside] = cKDTree(nodes).query(points[outside])[0] if len(nodes) else np.inf
-        near[outside] = upper[outside]
+    upper[outside] = near[outside] = _to_nodes(surface, patch[outside], points[outside])
     return upper, near
+
+
+def _to_nodes(surface, patch, points) -> NDArray:
+    """Return the distances (n,) of points to the nearest opaque node of their patch; inf where it has none."""
+    begins, counts = surface.node_offset[patch], np.diff(surface.node_offset)[patch]
+    row = np.repeat(np.arange(len(patch)), counts)
+    local = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+    node, m = begins[row] + local, surface.size[patch[row], 0]
+    place = (surface.origins[patch[row]].astype(np.float64) + (local % m)[:, None] * surface.axis_x[patch[row]]
+             + (local // m)[:, None] * surface.axis_y[patch[row]]
+             + surface.displacements[node, None] * surface.axis_z[patch[row]])
+    gap = np.linalg.norm(place - points[row], axis=1)
+    gap[~surface.opaque[node]] = np.inf
+    return np.minimum.reduceat(gap, np.cumsum(counts) - counts) if len(patch) else np.zeros(0)
