@@ -18,6 +18,7 @@ from ..render.frame import Frame
 from ..render.patch_drawing import PatchDrawing
 from ..render.renderer import Renderer, checked_lod, checked_size
 from ..render.scene import Scene, as_scene
+from ..render.tiles import BIN
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
@@ -141,9 +142,10 @@ def _overview(scene: Scene, view: View, times: Times, device) -> Section:
             ("Frame", f"{1e3 * middle:.2f} ms, the median of {FRAMES}, {1 / middle:.0f} a second; the first, with its "
                       f"kernels and uploads, {1e3 * times.first:.0f} ms"),
             ("Device", f"{device.name} ({device.platform_name}, {device.driver})"), ("clsurf", __version__)]
-    cost = f"tests and evaluations per pixel: mean {frame.cost[shown].mean():.1f}, brightest at least " \
-           f"{np.percentile(frame.cost[shown], 99):.0f}" if shown.any() else "nothing to see"
-    pictures = picture(to_srgb8(frame.color), "the view") + picture(heat(frame.cost, shown), cost)
+    cost = frame.cost / BIN ** 2  # the channel counts for all pixels of a bin
+    work = f"tests and evaluations per pixel: mean {cost[shown].mean():.1f}, brightest from " \
+           f"{np.percentile(cost[shown], 99):.3g} up" if shown.any() else "nothing to see"
+    pictures = picture(to_srgb8(frame.color), "the view") + picture(heat(cost, shown), work)
     return Section("Overview", table((), rows) + f'<div class="pictures">{pictures}</div>')
 
 

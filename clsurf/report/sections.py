@@ -34,13 +34,15 @@ class View:
 
 
 def table(head, rows) -> str:
-    """Return a table; the first cell of a row is its heading. Texts are escaped."""
-    top = "<thead><tr>" + "".join(f'<th scope="col">{escape(str(c))}</th>' for c in head) + "</tr></thead>" \
-        if head else ""
-    lines = ("<tr>" + f'<th scope="row">{escape(str(first))}</th>' + "".join(f"<td>{escape(str(c))}</td>" for c in rest)
-             + "</tr>" for first, *rest in rows)
+    """Return a table; the first cell of a row is its heading, indented where it is in lower case. Texts are escaped."""
+    lines = ["<thead><tr>", *(f'<th scope="col">{escape(c)}</th>' for c in head), "</tr></thead>"] if head else []
+    lines.append("<tbody>")
+    for first, *rest in rows:
+        part = ' class="part"' if head and first[:1].islower() else ""
+        lines += [f'<tr{part}><th scope="row">{escape(first)}</th>', *(f"<td>{escape(str(c))}</td>" for c in rest),
+                  "</tr>"]
     kind = "numbers" if head else "facts"
-    return f'<div class="wide"><table class="{kind}">{top}<tbody>{"".join(lines)}</tbody></table></div>'
+    return f'<div class="wide"><table class="{kind}">{"".join(lines)}</tbody></table></div>'
 
 
 # Spatial patches ------------------------------------------------------------------------------------------------------
@@ -133,9 +135,9 @@ def slim_sections(surface, view: View, number: int) -> list[Section]:
     model = Section("Model", table(("", "this model"), rows) + "<h3>Surfels by level</h3>" + chart)
     if not s.covered:
         return [model, Section("View", "<p>No pixel shows this surface.</p>")]
-    spread = lambda v: f"{v.mean():.1f} in the mean, {np.median(v):.0f} in the middle, {v.max():,} at most"  # noqa: E731
+    spread = lambda v: f"mean {v.mean():.1f}, median {np.median(v):.3g}, at most {v.max():.3g}"  # noqa: E731
     facts = [("Pixels that show it", f"{s.covered:,}"), ("Surfels blended at a pixel", spread(s.blended)),
-             ("Evaluations for a pixel", spread(s.cost))]
+             ("Evaluations a pixel", spread(s.cost))]
     drawn = columns([str(k) for k in levels], s.pixels_by_level.tolist(), "pixels by level",
                     "level of the surfel in front, pixels")
     most = int(np.percentile(s.blended, 99)) + 1

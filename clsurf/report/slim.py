@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..render.frame import Frame
+from ..render.tiles import BIN
 from ..surface.placed import Placed
 from ..surface.slim import FLOATS, SlimSurface
 
@@ -25,7 +26,7 @@ class SlimStatistics:
     covered: int  # pixels that show the surface
     pixels_by_level: NDArray  # (levels,) int: covered pixels by the level of the surfel in front
     blended: NDArray  # (covered,) int: surfels blended at each covered pixel
-    cost: NDArray  # (covered,) int: evaluations of surfels per pixel
+    cost: NDArray  # (covered,) float: evaluations of surfels per pixel, the mean of the pixel's bin of 8 x 8
 
 
 def slim_statistics(surface: SlimSurface | Placed, frame: Frame, number: int = 0) -> SlimStatistics:
@@ -53,4 +54,4 @@ def slim_statistics(surface: SlimSurface | Placed, frame: Frame, number: int = 0
         floats=FLOATS[own.degree] * leaves, leaves_by_level=count(own.level[own.leaf]),
         internal_by_level=count(own.level[~own.leaf]), covered=int(shown.sum()),
         pixels_by_level=count(np.maximum(frame.level[shown], 0)), blended=frame.count[shown].astype(np.int64),
-        cost=frame.cost[shown].astype(np.int64))
+        cost=frame.cost[shown] / BIN ** 2)

@@ -3,8 +3,8 @@
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2430; --quiet: #5b6675; --line: #d8dee6; --ground: #ffffff; --card: #f6f8fa;
   --c0: #2f6fb0; --c1: #e08a2c; --c2: #5a9e57; --c3: #a5569b; --c4: #8a8f98; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e4e9f0; --quiet: #9aa6b5; --line: #38424f; --ground: #14181e;
-  --card: #1d232b; --c0: #5b9bdc; --c1: #eba455; --c2: #7dbf79; --c3: #c57fbc; --c4: #a3a9b3; } }
+@media screen and (prefers-color-scheme: dark) { :root { --ink: #e4e9f0; --quiet: #9aa6b5; --line: #38424f;
+  --ground: #14181e; --card: #1d232b; --c0: #5b9bdc; --c1: #eba455; --c2: #7dbf79; --c3: #c57fbc; --c4: #a3a9b3; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 1.5rem; max-width: 68rem; background: var(--ground); color: var(--ink);
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-serif; }
@@ -14,6 +14,7 @@ h3 { font-size: 1rem; margin: 1.2rem 0 .4rem; }
 p { max-width: 48rem; color: var(--quiet); margin: .2rem 0 .8rem; }
 section { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 1rem 1.2rem;
   margin: 0 0 1.2rem; break-inside: avoid; }
+.part th { font-weight: 400; padding-left: 1rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 0 0 .8rem; }
 th, td { padding: .22rem .8rem .22rem 0; text-align: left; border-bottom: 1px solid var(--line); vertical-align: top; }
@@ -26,7 +27,7 @@ th { font-weight: 600; white-space: nowrap; }
 figure { margin: 0; flex: 1 1 18rem; min-width: 0; max-width: 100%; }
 img { display: block; max-width: 100%; height: auto; background: #fff; border: 1px solid var(--line); }
 figcaption { color: var(--quiet); font-size: .85rem; }
-svg { display: block; width: 100%; max-width: 46rem; height: auto; }
+svg { display: block; width: 100%; max-width: 46rem; height: auto; margin: 0 0 .8rem; }
 svg text { font-size: 13px; fill: var(--ink); }
 svg .label { fill: var(--quiet); }
 .c0 { fill: var(--c0); } .c1 { fill: var(--c1); } .c2 { fill: var(--c2); }
