@@ -5,36 +5,57 @@ nodes' heights are fitted to the points of the region's own sheet; a node shows 
 paper on spatial patches, section 4.5, takes few global range images instead, which leave much uncovered: patch_views.)
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..device import Device
 from ..errors import Cancelled, InputError
 from ..surface.patch import PatchSurface
+from .patch_error import patch_distances
 from .patch_points import SheetPoints, encoded, sheet_points
-from .patch_regions import Regions, find_regions
+from .patch_regions import WIDEN, Regions, Sheet, find_regions, missed_regions
 from .quantize import quantized
 
 SPACING = 1.25  # default distance between nodes, over the points'; below 1.2 holes appear between points
 REACH = 2.2  # of the points that a height is fitted to, over the node spacing (or 1.2 point spacings)
-SUPPORT = 1.5  # distance from a node, or from the middle of a cell, to its nearest point, over the point spacing
-WIDEN = 0.9  # how far a patch goes beyond its region's points, over their spacing, before it is rounded up to nodes
-TOLERANCE = 1.0  # heights over the reference that count as the same sheet, over the reach / 2.2
+SUPPORT = 1.5  # distance from a node, or from the middle of a cell, to its nearest point, over the region's spacing
+FARTHEST = 2.0  # the same, over the median distance between nearest points; or SUPPORT over the cloud's spacing
+NOISY = 7.0  # the same over the noise: 15 raw range images that do not quite meet (0.6 spacings) become one surface
+TOLERANCE = 1.0  # heights over the reference that count as the same sheet, over the node spacing (or as above)
 SLACK = 1.0  # the same, added at the full reach
-FRAME = 20  # floats a patch (fit_patch_nodes.cl)
+THICK = 4.0  # the same, over the noise
+MISSED = 1.5  # distance of points from their patch, over the node spacing, from which they get one of their own
+BOUND_SHARE = 0.999  # of the points lie within `bound` of the surface
+BOUND_SAMPLES = 1 << 16
+FRAME = 18  # floats a patch (fit_patch_nodes.cl)
+TILES = {16: (4, 4), 8: (4, 2), 4: (2, 2), 1: (1, 1)}  # nodes that a work-item fits, by lanes
 
 
 @dataclass(eq=False)
-class Nodes:
-    """What fit_patch_nodes gives: (p, n, m) arrays in the units of the points' tree."""
+class Patches:
+    """Fitted patches of some regions; lengths in the units of the points' tree.
 
+    Attributes
+    ----------
+    regions : Regions
+    corner : (p, 3) float64
+        Node (0, 0) at height 0.
+    axes : (p, 3, 3) float64
+        Unit x, y, z.
+    height : (p, n, m) float64
+        NaN where a node does not show.
+    light : (4, p, n, m) float32 or None
+        Linear, premultiplied.
+    """
+
+    regions: Regions
+    corner: NDArray
+    axes: NDArray
     height: NDArray
-    near2: NDArray  # squared distance to the nearest point of the sheet
-    cell2: NDArray  # the same from the middle of the cell between this node and (i + 1, j + 1)
-    fitted: NDArray  # bool
-    light: NDArray | None  # (4, p, n, m) linear, premultiplied
+    light: NDArray | None
 
 
 def convert(scan, request, device: Device, progress) -> PatchSurface:
@@ -42,8 +63,9 @@ def convert(scan, request, device: Device, progress) -> PatchSurface:
     step(progress, 0.0, "normals")
     points = sheet_points(scan, device)
     step(progress, 0.4, "regions")
+    sheet = Sheet(points)
     spacing = SPACING * points.spacing if request.spacing is None else float(request.spacing)
-    surface = patches_at(points, spacing, request, progress)
+    surface = patches_at(sheet, spacing, request, lambda share, what: step(progress, 0.4 + 0.6 * share, what))
     step(progress, 1.0, "done")
     return surface
 
@@ -54,42 +76,100 @@ def step(progress, fraction: float, what: str) -> None:
         raise Cancelled("build_patches: stopped by the progress callback")
 
 
-def patches_at(points: SheetPoints, spacing: float, request, progress) -> PatchSurface:
+def patches_at(sheet: Sheet, spacing: float, request, progress) -> PatchSurface:
     """Return the patches whose nodes stand `spacing` (world units) apart."""
-    unit = points.diagonal
-    gap = spacing / unit
+    points = sheet.points
+    gap = spacing / points.diagonal
     m, n = request.nodes
-    loss = 2 * WIDEN * points.spacing / unit
-    width = tuple(max(k * gap - loss, 0.5 * k * gap) for k in (max(m, n) - 1, min(m, n) - 1))
-    regions = find_regions(points, width, gap)
-    if not len(regions):
+    size = ((max(m, n) - 1) * gap, (min(m, n) - 1) * gap)
+    regions = find_regions(sheet, size)
+    progress(0.5, "nodes")
+    parts = [fitted(sheet, regions, gap, (m, n))]
+    progress(0.8, "missed points")
+    distance = own_distance(sheet, parts[0], gap)
+    regions = missed_regions(sheet, distance > MISSED * gap, size)
+    parts.append(fitted(sheet, regions, gap, (m, n), thick=False))
+    progress(0.9, "bound")
+    return assembled(points, parts, spacing, request)
+
+
+def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request) -> PatchSurface:
+    """Return the surface in world units, without the patches that show nothing."""
+    keep = np.concatenate([np.isfinite(part.height).any(axis=(1, 2)) for part in parts])
+    if not keep.any():
         raise InputError("scan: expected points that form a surface, got only scattered ones")
-    step(progress, 0.7, "nodes")
-    nodes, corner, axes = fitted_nodes(points, regions, gap, (m, n))
-    opaque = supported(nodes, gap, points.spacing / unit)
-    heights = np.where(opaque, nodes.height.astype(np.float64) * unit, np.nan).reshape(len(regions), -1)
-    keep = opaque.any(axis=(1, 2))
+    height = np.concatenate([part.height for part in parts])[keep].astype(np.float64) * points.diagonal
+    corner = np.concatenate([part.corner for part in parts])[keep] * points.diagonal + points.middle
+    axes = np.concatenate([part.axes for part in parts])[keep]
     colors = None
-    if nodes.light is not None:
-        colors = encoded(nodes.light[:, keep].reshape(4, -1).T)
-        if not request.precise:
-            colors = colors[:, :3]
-    return quantized((corner * unit + points.middle)[keep], axes[keep, 0] * spacing, axes[keep, 1] * spacing,
-                     heights[keep].ravel(), (m, n), colors, request.precise, origin=points.origin,
-                     diagonal=points.diagonal, oriented=points.oriented)
+    if points.light is not None:
+        colors = encoded(np.concatenate([part.light for part in parts], axis=1)[:, keep].reshape(4, -1).T)
+        colors = colors if request.precise else colors[:, :3]
+    surface = quantized(corner, axes[:, 0] * spacing, axes[:, 1] * spacing, height.ravel(), request.nodes, colors,
+                        request.precise, origin=points.origin, diagonal=points.diagonal, oriented=points.oriented)
+    first, missed = (part.regions.label for part in parts)
+    number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)
+    patch = number[np.where(missed >= 0, missed + len(parts[0].regions), first)]
+    return replace(surface, bound=bound(surface, points, patch), bound_share=BOUND_SHARE)
 
 
-def fitted_nodes(points: SheetPoints, regions: Regions, gap: float, size) -> tuple[Nodes, NDArray, NDArray]:
+def own_distance(sheet: Sheet, patches: Patches, gap: float) -> NDArray:
+    """Return the distance (n,) of each point to the cell of its own patch over or under it, tree units.
+
+    Infinity where that cell does not show, and where a point has no patch.
+    """
+    label = patches.regions.label
+    rows = np.flatnonzero(label >= 0)
+    label = label[rows]
+    offset = sheet.position[rows] - patches.corner[label]
+    u, v, w = (np.einsum("ij,ij->i", offset, patches.axes[label, k]) for k in range(3))
+    n, m = patches.height.shape[1:]
+    i, j = (np.clip((a / gap).astype(np.int64), 0, k - 2) for a, k in ((u, m), (v, n)))
+    s, t = u / gap - i, v / gap - j
+    flat, first = patches.height.ravel(), (label * n + j) * m + i
+    a, b, c, d = (flat[first + k].astype(np.float64) for k in (0, 1, m, m + 1))
+    du, dv = (1 - t) * (b - a) + t * (d - c), (1 - s) * (c - a) + s * (d - b)
+    away = np.abs((1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d) - w)
+    out = np.full(len(sheet), np.inf)
+    away /= np.sqrt(1 + (du * du + dv * dv) / gap**2)
+    out[rows] = np.where(np.isfinite(away), away, np.inf)
+    return out
+
+
+def bound(surface: PatchSurface, points: SheetPoints, patch: NDArray) -> float:
+    """Return the distance (world units) that `BOUND_SHARE` of a sample of the points keep.
+
+    Parameters
+    ----------
+    patch : (n,) int
+        Patch of each point; -1 for none.
+    """
+    rows = np.arange(0, len(points), max(1, len(points) // BOUND_SAMPLES))
+    patch, place = patch[rows], points.position[rows].astype(np.float64)
+    distance = np.full(len(rows), np.inf)
+    own = patch >= 0
+    distance[own] = patch_distances(surface, patch[own], place[own])[0]
+    far = np.flatnonzero(distance > np.linalg.norm(surface.axis_x[0]))  # perhaps nearer to another patch
+    nodes = surface.positions() - surface.origin
+    nodes = nodes[np.isfinite(nodes[:, 0])]
+    if len(far) and len(nodes):
+        distance[far] = np.minimum(distance[far], cKDTree(nodes).query(place[far])[0])
+    return float(np.quantile(distance, BOUND_SHARE, method="higher"))
+
+
+def fitted(sheet: Sheet, regions: Regions, gap: float, size, thick: bool = True) -> Patches:
     """Fit the nodes of every region's patch.
 
-    Returns
-    -------
-    nodes : Nodes
-    corner : (p, 3) float64
-        Node (0, 0) at height 0, in the units of the points' tree.
-    axes : (p, 3, 3) float64
-        Unit x, y, z of the patches.
+    Parameters
+    ----------
+    gap : float
+        Between nodes, tree units.
+    size : (int, int)
+        Nodes of a patch along x and y.
+    thick : bool
+        Noise widens what counts as one sheet.
     """
+    points = sheet.points
     tree = points.tree
     device = tree.device
     m, n = size
@@ -98,38 +178,55 @@ def fitted_nodes(points: SheetPoints, regions: Regions, gap: float, size) -> tup
     frames = np.zeros((len(regions), FRAME), np.float32)
     frames[:, :3], frames[:, 3:12] = corner, axes.reshape(-1, 9)
     frames[:, 12], frames[:, 13] = regions.low, regions.high
+    coarse, noise = np.maximum(gap, 1.2 * regions.spacing), regions.noise * thick
+    frames[:, 14], frames[:, 15] = np.maximum(REACH * coarse, NOISY * noise), WIDEN * regions.spacing
+    frames[:, 16], frames[:, 17] = np.maximum(TOLERANCE * coarse, THICK * noise), SLACK * coarse
     region = np.full(tree.padded, -1, np.int32)
     region[:len(points)] = regions.label
-    coarse = max(gap, 1.2 * points.spacing / points.diagonal)
     colored = points.light is not None
     lanes = device.lanes
-    tiles = [-(-k // side) for k, side in zip(size, {16: (4, 4), 8: (4, 2), 4: (2, 2), 1: (1, 1)}[lanes], strict=True)]
+    tiles = [-(-k // side) for k, side in zip(size, TILES[lanes], strict=True)]
+    if not len(regions):
+        return Patches(regions, corner, axes, np.zeros((0, n, m), np.float32),
+                       np.zeros((4, 0, n, m), np.float32) if colored else None)
+    device.check_memory(nodes=(32 if colored else 16) * len(regions) * m * n)
     out = device.empty((8 if colored else 4, len(regions), n, m), np.float32)
     kernel = device.kernel("build/fit_patch_nodes.cl", constants={"VW": lanes, "COLORED": int(colored)})
     light = device.upload(points.light) if colored else tree.sorted
     kernel((len(regions) * tiles[0] * tiles[1],), (1,), len(regions), m, n, *tiles, device.upload(frames), gap,
-           REACH * coarse, WIDEN * points.spacing / points.diagonal, TOLERANCE * coarse, SLACK * coarse,
            *tree.arguments, device.upload(region), light, out)
-    result = device.download(out)
-    return Nodes(result[0], result[1], result[2], result[3] > 0, result[4:] if colored else None), corner, axes
+    height, near2, cell2, known, *light = device.download(out)
+    farthest = max(FARTHEST * points.nearest, SUPPORT * points.spacing) / points.diagonal
+    shows = supported(known > 0, near2, cell2, np.maximum(np.minimum(SUPPORT * regions.spacing, farthest), 0.75 * gap))
+    return Patches(regions, corner, axes, np.where(shows, height, np.float32("nan")),
+                   np.stack(light) if colored else None)
 
 
-def supported(nodes: Nodes, gap: float, spacing: float) -> NDArray:
+def supported(known: NDArray, near2: NDArray, cell2: NDArray, support: NDArray) -> NDArray:
     """Return which nodes (p, n, m) bool show: those near a point, less one of every cell whose middle is not.
+
+    Nodes of no whole cell would not be drawn and do not show either.
 
     Parameters
     ----------
-    gap, spacing : float
-        Of nodes and points, in the units of the nodes.
+    known : (p, n, m) bool
+        Nodes with a height.
+    near2, cell2 : (p, n, m) float32
+        Squared distance to the nearest point of the sheet from the node, and from the middle of the cell after it.
+    support : (p,) float
+        Largest distance to a point.
     """
-    far2 = max(SUPPORT * spacing, 0.75 * gap) ** 2
-    opaque = nodes.fitted & (nodes.near2 <= far2)
-    corners = [(slice(None), slice(j, opaque.shape[1] - 1 + j), slice(i, opaque.shape[2] - 1 + i))
-               for j in (0, 1) for i in (0, 1)]
-    bridging = np.logical_and.reduce([opaque[c] for c in corners]) & ~(nodes.cell2[:, :-1, :-1] <= far2)
-    near2 = np.stack([nodes.near2[c] for c in corners])
-    worst = np.argmax(near2, axis=0)
-    out = opaque.copy()
+    far2 = support[:, None, None] ** 2
+    shows = known & (near2 <= far2)
+    n, m = shows.shape[1:]
+    corners = [(slice(None), slice(j, n - 1 + j), slice(i, m - 1 + i)) for j in (0, 1) for i in (0, 1)]
+    bridging = np.logical_and.reduce([shows[c] for c in corners]) & ~(cell2[:, :-1, :-1] <= far2)
+    worst = np.argmax(np.stack([near2[c] for c in corners]), axis=0)
+    out = shows.copy()
     for k, c in enumerate(corners):
         out[c] &= ~(bridging & (worst == k))
-    return out
+    whole = np.logical_and.reduce([out[c] for c in corners])
+    drawn = np.zeros_like(out)
+    for c in corners:
+        drawn[c] |= whole
+    return drawn

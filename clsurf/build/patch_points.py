@@ -31,8 +31,12 @@ class SheetPoints:
         Linear, premultiplied by alpha, in the same order.
     neighbours : (n, NEIGHBOURS + 1) int32
         Nearest points of each, itself first; -1 where there are fewer.
+    local : (n,) float32
+        Spacing around each point, world units, from the furthest of its neighbours.
     spacing : float
         World units: side of the squares of an even grid as dense as the points, the median over them.
+    nearest : float
+        World units: median distance to the nearest other point.
     diagonal : float
         Of the box without outliers.
     middle : (3,) float32
@@ -46,7 +50,9 @@ class SheetPoints:
     normals: NDArray
     light: NDArray | None
     neighbours: NDArray
+    local: NDArray
     spacing: float
+    nearest: float
     diagonal: float
     middle: NDArray
     origin: NDArray
@@ -85,10 +91,12 @@ def sheet_points(scan, device: Device) -> SheetPoints:
         light = np.zeros((4, tree.padded), np.float32)
         light[:, :len(position)] = colors[tree.order].T
     boxes = box_tree(position, device)
-    neighbours = nearest(boxes, min(NEIGHBOURS + 1, len(position)))[0]
+    neighbours, distance = nearest(boxes, min(NEIGHBOURS + 1, len(position)))
+    local = distance[:, -1] / np.float32(math.sqrt((distance.shape[1] - 0.5) / math.pi))
     spacing = even_spacing(boxes, position)
     oriented = getattr(scan, "normals", None) is not None or agreement(position, normals, neighbours) >= AGREED
-    return SheetPoints(tree, position, normals, light, neighbours, spacing, diagonal, middle, scan.origin, oriented)
+    return SheetPoints(tree, position, normals, light, neighbours, local, spacing,
+                       float(np.median(distance[:, 1])), diagonal, middle, scan.origin, oriented)
 
 
 def means(values: NDArray, target: NDArray, count: int) -> NDArray:

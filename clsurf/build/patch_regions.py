@@ -1,26 +1,29 @@
 """Regions of a cloud that one patch each can show: flat, of one sheet, connected, and no larger than a patch.
 
-Seeds are spread over the points and moved by Lloyd's iteration over position and normal; what hangs together in a
-region stays one, what does not is split, and what is larger than a patch is cut in two.
+Seeds are spread over the points and moved by Lloyd's iteration over position and normal (patch_seeds); what hangs
+together in a region stays one, what does not is split, what is larger than a patch is cut in two, and neighbours that
+fit into one patch are joined.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from .orientation import cell_numbers
+from ..surface.slim import frame_of_normals
 from .patch_points import SheetPoints
+from .patch_seeds import FIRST, first_seeds, lloyd, renumbered
 
-ROUNDS = 6  # of Lloyd's iteration
-FLATNESS = 3.0  # weight of squared distances from a region's plane, over those along it
-BEND = 0.85  # cost of 1 - cosine between normals, over the squared width of a patch: 45 degrees cost half a width
 CONE = 0.35  # least cosine between a region's normal and those of its points; 0.35 is 70 degrees
 STEEP = 0.7  # sine of the angle of an edge with the tangent planes above which it leads to another sheet
 SMALL = 0.06  # of a patch's area: smaller regions join a neighbour where they hang together with one
 LEAST = 4  # points of a region; fewer are outliers
-ANGLES = 12  # orientations tried for the smallest rectangle around a region
+LEFT = 10  # points of a region of those that the first patches missed
+WIDEN = 0.9  # how far a patch goes beyond its region's points, over their spacing, before it is rounded up to nodes
+SPARSE = 3.0  # largest spacing of a region over that of the cloud
+MERGES = 6  # rounds of joining two regions that fit into one patch
+ANGLES = np.arange(16) * (np.pi / 32)  # orientations tried for the smallest rectangle around a region
 
 
 @dataclass(eq=False)
@@ -29,16 +32,20 @@ class Regions:
 
     Attributes
     ----------
-    label : (n,) int32
+    label : (n,) int
         Region of each point, -1 for none.
     center : (r, 3) float64
         Middle of the rectangle around a region's points, in its plane.
     axes : (r, 3, 3) float64
-        Unit x, y, z; z is the normal.
+        Unit x, y, z; z is the mean normal, x along the longer side.
     extent : (r, 2) float64
         Sides of the rectangle along x and y.
     low, high : (r,) float64
         Heights of the points over the centre.
+    spacing : (r,) float64
+        Of the region's points: at least that of the cloud, at most `SPARSE` times as much.
+    noise : (r,) float64
+        Deviation of neighbouring points across the surface, root mean square.
     """
 
     label: NDArray
@@ -47,148 +54,88 @@ class Regions:
     extent: NDArray
     low: NDArray
     high: NDArray
+    spacing: NDArray
+    noise: NDArray
 
     def __len__(self):
         return len(self.center)
 
 
-class _Sheet:
-    """Points in the tree's coordinates, with the graph of those that lie on one sheet."""
+class Sheet:
+    """Points in the tree's coordinates, with the graph of those that lie on one sheet.
+
+    Attributes
+    ----------
+    position, normals : (n, 3) float64
+    rows, columns : (e,) int32
+        Edges of the graph, from each point to its neighbours of the same sheet.
+    spacing : float
+    local : (n,) float64
+        Spacing around each point.
+    noise2 : (n,) float64
+        Mean squared deviation of its neighbours across the surface.
+    """
 
     def __init__(self, points: SheetPoints):
         self.points = points
+        self.spacing = points.spacing / points.diagonal
         self.position = (points.position.astype(np.float64) - points.middle) / points.diagonal
         self.normals = points.normals.astype(np.float64)
-        near = points.neighbours[:, 1:]
-        rows = np.repeat(np.arange(len(near)), near.shape[1])
-        columns = near.ravel()
-        keep = columns >= 0
-        rows, columns = rows[keep], columns[keep]
-        edge = (self.position[columns] - self.position[rows]).astype(np.float32)
-        n, m = points.normals[rows], points.normals[columns]
-        off = np.abs(np.einsum("ij,ij->i", edge, n + m)) / 2
-        length = np.maximum(np.linalg.norm(edge, axis=1), points.spacing / points.diagonal)
-        keep = (np.einsum("ij,ij->i", n, m) > CONE) & (off <= STEEP * length)
-        self.rows, self.columns = rows[keep], columns[keep]
+        self.local = np.clip(points.local / points.diagonal, self.spacing, SPARSE * self.spacing)
+        count = len(self)
+        kept, agreed, off2 = [np.zeros((0, 2), np.int32)], np.zeros(count, np.int32), np.zeros(count)
+        own = np.arange(count, dtype=np.int32)
+        for near in points.neighbours[:, 1:].T:  # one neighbour of all points at a time: memory
+            edge = self.position[near] - self.position
+            m = self.normals[near]
+            off = np.abs(np.einsum("ij,ij->i", edge, self.normals + m)) / 2
+            agree = (near >= 0) & (np.einsum("ij,ij->i", self.normals, m) > CONE)
+            agreed += agree
+            off2 += np.where(agree, off * off, 0)
+            length = np.maximum(np.sqrt(np.einsum("ij,ij->i", edge, edge)), self.spacing)
+            keep = agree & (off <= STEEP * length)
+            kept.append(np.stack([own[keep], near[keep]], axis=1))
+        self.noise2 = off2 / (2 * np.maximum(agreed, 1))
+        self.rows, self.columns = np.ascontiguousarray(np.concatenate(kept).T)
 
     def __len__(self):
         return len(self.position)
 
 
-def find_regions(points: SheetPoints, width: tuple[float, float], step: float) -> Regions:
-    """Divide the points into regions whose rectangles are at most `width`.
+def find_regions(sheet: Sheet, size: tuple[float, float]) -> Regions:
+    """Divide the points into regions that fit into a patch.
 
     Parameters
     ----------
-    width : (float, float)
-        Largest extent along the longer and the shorter side, in the tree's units.
-    step : float
-        Node spacing, in the tree's units.
+    size : (float, float)
+        Longer and shorter side of a patch, in the tree's units.
     """
-    sheet = _Sheet(points)
-    side = float(np.sqrt(width[0] * width[1]))
-    label = lloyd(sheet, first_seeds(sheet, 0.8 * side), side)
+    side = max(float(np.sqrt(size[0] * size[1])) - 2 * WIDEN * sheet.spacing, 0.5 * size[1])
+    label = lloyd(sheet, first_seeds(sheet, FIRST * side), side)
     label = connected(sheet, label)
-    smallest = SMALL * (side / (points.spacing / points.diagonal)) ** 2
+    smallest = SMALL * (side / sheet.spacing) ** 2
     label = joined(sheet, label, smallest)
-    for _ in range(12):
-        regions = framed(sheet, label)
-        cut = oversize(sheet, regions, width)
-        if not cut.any():
-            break
-        label = halved(sheet, label, cut)
-    return without_outliers(sheet, label)
+    return without_outliers(sheet, merged(sheet, fitting(sheet, label, size), size), smallest)
 
 
-def first_seeds(sheet: _Sheet, side: float) -> NDArray:
-    """Return a label (n,) for each point: its cube of side `side` and the cube face that its normal points to."""
-    cell, _ = cell_numbers(sheet.position.astype(np.float32), side)
-    axis = np.argmax(np.abs(sheet.normals), axis=1)
-    face = 2 * axis + (sheet.normals[np.arange(len(axis)), axis] < 0)
-    return np.unique(cell * 6 + face, return_inverse=True)[1]
+def missed_regions(sheet: Sheet, missed: NDArray, size: tuple[float, float]) -> Regions:
+    """Return regions of the points `missed` (n,) bool alone, those of at least `LEFT` points."""
+    label = connected(sheet, np.where(missed, 0, -1))
+    sizes = np.bincount(label[label >= 0], minlength=1)
+    _, label = renumbered(np.where((label >= 0) & (sizes[label] >= LEFT), label, -1))
+    return fitting(sheet, label, size)
 
 
-def region_sums(label: NDArray, columns, count: int) -> list[NDArray]:
-    """Return the sums (count,) of each column (n,) over the labels."""
-    return [np.bincount(label, column, count) for column in columns]
-
-
-def lloyd(sheet: _Sheet, label: NDArray, side: float) -> NDArray:
-    """Return the labels (n,) after `ROUNDS` rounds of moving seeds to the means of their points."""
-    tree = sheet.points.tree
-    device = tree.device
-    kernel = device.kernel("build/assign_regions.cl", constants={"VW": device.lanes})
-    on_device = np.zeros(tree.padded, np.int32)
-    for number in range(ROUNDS):
-        seeds, label = seed_records(sheet, label)
-        if number == ROUNDS // 2:  # what lost its points to better seeds
-            seeds, label = without_small(seeds, label)
-        order, boxes = sorted_seeds(seeds)
-        place = np.empty(len(order), np.int32)
-        place[order] = np.arange(len(order))
-        on_device[:len(label)] = place[label]
-        labels = device.empty(tree.padded, np.int32)
-        device.write(labels, on_device)
-        kernel((-(-tree.count // device.lanes),), (1,), tree.count, tree.padded, tree.sorted, len(seeds),
-               device.upload(seeds[order]), device.upload(boxes), FLATNESS, BEND * side**2, labels)
-        label = device.download(labels)[:tree.count]
-    return label
-
-
-def seed_records(sheet: _Sheet, label: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the seeds (s, 8) float32 of the labels in use (place, unit normal, 0, 0), and the labels renumbered."""
-    used, label = renumbered(label)
-    sizes = np.bincount(label, minlength=used)
-    out = np.zeros((used, 8), np.float32)
-    for k in range(3):
-        out[:, k] = np.bincount(label, sheet.position[:, k], used) / sizes
-        out[:, 3 + k] = np.bincount(label, sheet.normals[:, k], used)
-    length = np.linalg.norm(out[:, 3:6], axis=1, keepdims=True)
-    out[:, 3:6] = np.where(length > 1e-6, out[:, 3:6] / np.maximum(length, 1e-6), [0, 0, 1])
-    return out, label
-
-
-def renumbered(label: NDArray) -> tuple[int, NDArray]:
-    """Return how many labels 0, 1, ... are in use, and the labels without the unused; negative ones stay."""
-    used = np.bincount(label[label >= 0])
-    number = np.cumsum(used > 0) - 1
-    return int((used > 0).sum()), np.where(label >= 0, number[np.maximum(label, 0)] if len(number) else -1, -1)
-
-
-def without_small(seeds: NDArray, label: NDArray) -> tuple[NDArray, NDArray]:
-    """Drop the seeds with less than a quarter of the median number of points; these start anew at seed 0."""
-    sizes = np.bincount(label, minlength=len(seeds))
-    keep = sizes >= 0.25 * np.median(sizes)
-    number = np.where(keep, np.cumsum(keep) - 1, 0)
-    return seeds[keep], number[label]
-
-
-def sorted_seeds(seeds: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the order (s,) of seeds along a Morton curve, and the boxes (ceil(s / 16), 8) of 16 each."""
-    place = seeds[:, :3]
-    low, high = place.min(axis=0), place.max(axis=0)
-    cell = ((place - low) / max(float((high - low).max()), 1e-30) * 1023).astype(np.int64)
-    code = np.zeros(len(seeds), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
-    order = np.lexsort((*seeds.T[:6], code))
-    starts = np.arange(0, len(seeds), 16)
-    boxes = np.zeros((len(starts), 8), np.float32)
-    boxes[:, :3] = np.minimum.reduceat(place[order], starts)
-    boxes[:, 3:6] = np.maximum.reduceat(place[order], starts)
-    return order, boxes
-
-
-def connected(sheet: _Sheet, label: NDArray) -> NDArray:
-    """Split the regions whose points do not hang together."""
-    inside = label[sheet.rows] == label[sheet.columns]
-    graph = sparse.coo_array((np.ones(int(inside.sum()), np.int8), (sheet.rows[inside], sheet.columns[inside])),
+def connected(sheet: Sheet, label: NDArray) -> NDArray:
+    """Split the regions whose points do not hang together; -1 stays."""
+    inside = (label[sheet.rows] == label[sheet.columns]) & (label[sheet.rows] >= 0)
+    graph = sparse.csr_array((np.ones(int(inside.sum()), np.int8), (sheet.rows[inside], sheet.columns[inside])),
                              shape=(len(label), len(label)))
-    return sparse.csgraph.connected_components(graph.tocsr(), directed=False)[1]
+    part = sparse.csgraph.connected_components(graph, directed=False)[1]
+    return renumbered(np.where(label >= 0, part, -1))[1]
 
 
-def joined(sheet: _Sheet, label: NDArray, smallest: float) -> NDArray:
+def joined(sheet: Sheet, label: NDArray, smallest: float) -> NDArray:
     """Give the regions with fewer than `smallest` points to the neighbour that most of their links lead to."""
     for _ in range(3):
         count, label = renumbered(label)
@@ -216,42 +163,42 @@ def joined(sheet: _Sheet, label: NDArray, smallest: float) -> NDArray:
     return renumbered(label)[1]
 
 
-def framed(sheet: _Sheet, label: NDArray) -> Regions:
-    """Return the regions of `label` with their frames: mean normals, and the smallest rectangles of `ANGLES`."""
-    used = np.flatnonzero(label >= 0)
-    order = used[np.argsort(label[used], kind="stable")]
-    sorted_label = label[order]
-    starts = np.flatnonzero(np.append(True, sorted_label[1:] != sorted_label[:-1]))
-    count = len(starts)
-    seeds, _ = seed_records_of(sheet, order, sorted_label, count)
-    center, z = seeds[:, :3], seeds[:, 3:]
-    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z), axis=1)])
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    y = np.cross(z, x)
-    offset = sheet.position[order] - center[sorted_label]
-    along = lambda axis: np.einsum("ij,ij->i", offset, axis[sorted_label]).astype(np.float32)  # noqa: E731
-    u, v, w = along(x), along(y), along(z)
-    span = lambda a: (np.minimum.reduceat(a, starts), np.maximum.reduceat(a, starts))  # noqa: E731
-    best, frame = np.full(count, np.inf), np.zeros((count, 5))
-    for angle in np.arange(ANGLES) * (np.pi / 2 / ANGLES):
-        c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-        (u0, u1), (v0, v1) = span(c * u + s * v), span(c * v - s * u)
-        area = np.maximum(u1 - u0, v1 - v0).astype(np.float64) ** 2 + 0.5 * (u1 - u0) * (v1 - v0)
-        better = area < best * (1 - 1e-5)
-        best = np.where(better, area, best)
-        frame[better] = np.stack([np.full(count, angle), u0, u1, v0, v1], axis=1)[better]
-    angle, u0, u1, v0, v1 = frame.T
-    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    x, y = c * x + s * y, c * y - s * x
-    center = center + ((u0 + u1) / 2)[:, None] * x + ((v0 + v1) / 2)[:, None] * y
-    turn = (v1 - v0) > (u1 - u0)  # x along the longer side
-    x, y = np.where(turn[:, None], y, x), np.where(turn[:, None], -x, y)
-    extent = np.sort(np.stack([u1 - u0, v1 - v0], axis=1), axis=1)[:, ::-1]
-    low, high = span(w)
-    return Regions(label, center, np.stack([x, y, z], axis=1), extent, low.astype(float), high.astype(float))
+def framed(sheet: Sheet, label: NDArray) -> Regions:
+    """Return the regions 0, 1, ... of `label` (n,) with their frames: mean normals, the smallest of 16 rectangles."""
+    rows = np.flatnonzero(label >= 0)
+    count = int(label.max(initial=-1)) + 1
+    if not count:
+        empty = np.zeros(0)
+        return Regions(label, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 2)), *[empty] * 4)
+    by_label = sparse.csr_array((rows, (label[rows], np.arange(len(rows)))), shape=(count, len(rows)))  # counting sort
+    order, start = by_label.data.astype(np.int32), by_label.indptr.astype(np.int32)
+    frames = np.zeros((count, 8), np.float32)
+    frames[:, :6] = mean_frames(sheet, order, label[order], count)
+    tree = sheet.points.tree
+    device = tree.device
+    out = device.empty((count, 5, 16), np.float32)
+    device.kernel("build/region_extents.cl")((count,), (1,), count, device.upload(start), device.upload(order),
+                                             tree.padded, tree.sorted, device.upload(frames), out)
+    low_u, high_u, low_v, high_v, heights = device.download(out).astype(np.float64).transpose(1, 0, 2)
+    across, along = high_u - low_u, high_v - low_v
+    # Short longer sides count more: only they decide how many patches a cloud needs.
+    best = np.argmin(np.maximum(across, along) ** 2 + 0.5 * across * along, axis=1)
+    pick = lambda a: a[np.arange(count), best]  # noqa: E731
+    z = frames[:, 3:6].astype(np.float64)
+    u, v = frame_of_normals(z)
+    c, s = np.cos(ANGLES[best])[:, None], np.sin(ANGLES[best])[:, None]
+    x, y = c * u + s * v, c * v - s * u
+    center = (frames[:, :3] + pick(low_u + high_u)[:, None] / 2 * x + pick(low_v + high_v)[:, None] / 2 * y)
+    extent = np.stack([pick(across), pick(along)], axis=1)
+    turn = (extent[:, 1] > extent[:, 0])[:, None]
+    x, y = np.where(turn, y, x), np.where(turn, -x, y)
+    sizes = np.maximum(np.diff(start), 1)
+    mean = lambda values: np.bincount(label[rows], values[rows], count) / sizes  # noqa: E731
+    return Regions(label, center, np.stack([x, y, z], axis=1), np.sort(extent, axis=1)[:, ::-1], heights[:, 0],
+                   heights[:, 1], mean(sheet.local), np.sqrt(mean(sheet.noise2)))
 
 
-def seed_records_of(sheet: _Sheet, order: NDArray, label: NDArray, count: int) -> tuple[NDArray, NDArray]:
+def mean_frames(sheet: Sheet, order: NDArray, label: NDArray, count: int) -> NDArray:
     """Return means of places and unit mean normals (count, 6) float64 of the points `order` with labels `label`."""
     sizes = np.bincount(label, minlength=count)
     out = np.empty((count, 6))
@@ -260,10 +207,10 @@ def seed_records_of(sheet: _Sheet, order: NDArray, label: NDArray, count: int) -
         out[:, 3 + k] = np.bincount(label, sheet.normals[order, k], count)
     length = np.linalg.norm(out[:, 3:], axis=1, keepdims=True)
     out[:, 3:] = np.where(length > 1e-9, out[:, 3:] / np.maximum(length, 1e-9), [0, 0, 1])
-    return out, sizes
+    return out
 
 
-def oversize(sheet: _Sheet, regions: Regions, width: tuple[float, float]) -> NDArray:
+def oversize(sheet: Sheet, regions: Regions, size: tuple[float, float]) -> NDArray:
     """Return which regions (r,) do not fit into a patch, or bend by more than `CONE`."""
     used = regions.label >= 0
     label = regions.label[used]
@@ -271,11 +218,29 @@ def oversize(sheet: _Sheet, regions: Regions, width: tuple[float, float]) -> NDA
     # Single wild normals do not count: a twentieth of the points must be off.
     bent = np.bincount(label, cosine < CONE, len(regions)) > 0.05 * np.bincount(label, minlength=len(regions))
     several = np.bincount(label, minlength=len(regions)) >= 2 * LEAST
-    wide = (regions.extent[:, 0] > width[0]) | (regions.extent[:, 1] > width[1])
-    return (bent & several) | wide
+    room = np.maximum(np.array(size) - 2 * WIDEN * regions.spacing[:, None], 0.5 * size[1])
+    return (bent & several) | (regions.extent > room).any(axis=1)
 
 
-def halved(sheet: _Sheet, label: NDArray, cut: NDArray) -> NDArray:
+def fitting(sheet: Sheet, label: NDArray, size: tuple[float, float]) -> Regions:
+    """Cut the regions of `label` until each fits into a patch."""
+    out, count = np.full(len(label), -1), 0
+    for _ in range(60):
+        regions = framed(sheet, label)
+        if not len(regions):
+            break
+        cut = oversize(sheet, regions, size)
+        done = np.append(~cut, False)[label]
+        number = np.cumsum(~cut) - 1 + count
+        out[done] = number[label[done]]
+        count += int((~cut).sum())
+        if not cut.any():
+            break
+        label = halved(sheet, np.where(done, -1, label), cut)
+    return framed(sheet, out)
+
+
+def halved(sheet: Sheet, label: NDArray, cut: NDArray) -> NDArray:
     """Cut the regions `cut` (r,) in two across the direction in which places and normals spread most."""
     rows = np.flatnonzero((label >= 0) & cut[np.maximum(label, 0)])
     number = (np.cumsum(cut) - 1)[label[rows]]
@@ -297,13 +262,98 @@ def halved(sheet: _Sheet, label: NDArray, cut: NDArray) -> NDArray:
     low, high = across[order[starts]], across[order[starts + sizes - 1]]
     upper = across > ((low + high) / 2)[number]
     out = label.copy()
-    out[rows[upper]] = int(label.max()) + 1 + number[upper]
+    out[rows[upper]] = len(cut) + number[upper]
     return renumbered(out)[1]
 
 
-def without_outliers(sheet: _Sheet, label: NDArray) -> Regions:
-    """Return the regions with at least `LEAST` points."""
+def merged(sheet: Sheet, regions: Regions, size: tuple[float, float]) -> NDArray:
+    """Return labels with pairs of neighbouring regions joined where one patch holds both.
+
+    Each round joins pairs that want each other: those whose common rectangle wastes the least.
+    """
+    rows, columns = sheet.rows, sheet.columns
+    free = np.ones(len(regions), bool)
+    for _ in range(MERGES):
+        count = len(regions)
+        a, b = regions.label[rows], regions.label[columns]
+        keep = (a != b) & (a >= 0) & (b >= 0)
+        rows, columns, a, b = rows[keep], columns[keep], a[keep], b[keep]
+        keep = free[a] & free[b]
+        pair = np.unique(np.minimum(a, b)[keep] * np.int64(count) + np.maximum(a, b)[keep])
+        a, b = pair // count, pair % count
+        area, fits = common_rectangles(regions, a, b, size)
+        own = regions.extent.prod(axis=1)
+        first, second = mutual(a[fits], b[fits], (area - own[a] - own[b])[fits], count)
+        if not len(first):
+            break
+        number = np.full(count + 1, -1)
+        number[first] = number[second] = np.arange(len(first))
+        joint = framed(sheet, number[regions.label])
+        good = ~oversize(sheet, joint, size)
+        free[first[~good]] = free[second[~good]] = False
+        regions, free = replaced(regions, first[good], second[good], joint, good), np.delete(free, second[good])
+    return regions.label
+
+
+def replaced(regions: Regions, first: NDArray, second: NDArray, joint: Regions, good: NDArray) -> Regions:
+    """Return `regions` with `second` joined to `first`; `joint` (where `good`) are the frames of the pairs."""
+    number = np.arange(len(regions) + 1)
+    number[second] = first
+    kept = np.ones(len(regions), bool)
+    kept[second] = False
+    place = np.append(np.cumsum(kept) - 1, -1)
+    number[-1] = len(regions)
+    arrays = {"label": place[number[regions.label]]}
+    for field in fields(Regions)[1:]:
+        values = getattr(regions, field.name).copy()
+        values[first] = getattr(joint, field.name)[good]
+        arrays[field.name] = values[kept]
+    return replace(regions, **arrays)
+
+
+def common_rectangles(regions: Regions, a: NDArray, b: NDArray, size) -> tuple[NDArray, NDArray]:
+    """Return the areas of rectangles that hold the rectangles of two regions, and whether a patch holds them."""
+    swap = regions.extent[a].prod(axis=1) < regions.extent[b].prod(axis=1)
+    a, b = np.where(swap, b, a), np.where(swap, a, b)
+    offset = regions.center[b] - regions.center[a]
+    low, high = -regions.extent[a] / 2, regions.extent[a] / 2
+    for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        half = regions.extent[b] / 2 * corner
+        place = offset + half[:, :1] * regions.axes[b, 0] + half[:, 1:] * regions.axes[b, 1]
+        at = np.stack([np.einsum("ij,ij->i", place, regions.axes[a, k]) for k in (0, 1)], axis=1)
+        low, high = np.minimum(low, at), np.maximum(high, at)
+    sides = high - low
+    room = np.maximum(np.array(size) - 2 * WIDEN * np.maximum(regions.spacing[a], regions.spacing[b])[:, None],
+                      0.5 * size[1])
+    facing = np.einsum("ij,ij->i", regions.axes[a, 2], regions.axes[b, 2]) > 0.5
+    # Rectangles of slanted regions overlap: a little more than the room is worth a try.
+    return sides.prod(axis=1), (np.sort(sides, axis=1)[:, ::-1] <= 1.1 * room).all(axis=1) & facing
+
+
+def mutual(a: NDArray, b: NDArray, cost: NDArray, count: int) -> tuple[NDArray, NDArray]:
+    """Return the pairs that are each other's cheapest."""
+    best = np.full(count, np.inf)
+    np.minimum.at(best, a, cost)
+    np.minimum.at(best, b, cost)
+    both = np.flatnonzero((best[a] == cost) & (best[b] == cost))
+    _, first = np.unique(a[both], return_index=True)  # equal costs: the first pair of each
+    both = both[first]
+    _, first = np.unique(b[both], return_index=True)
+    both = both[first]
+    both = both[~np.isin(b[both], a[both])]
+    return a[both], b[both]
+
+
+def without_outliers(sheet: Sheet, label: NDArray, smallest: float) -> Regions:
+    """Return the regions without outliers: those of fewer than `LEAST` points, and small ones close to a larger one.
+
+    The points of the latter, such as strays of overlaid scans, lie within reach of the larger region's patch.
+    """
     sizes = np.bincount(label[label >= 0])
-    keep = sizes >= min(LEAST, len(sheet))
+    large = np.append(sizes >= smallest, False)[label]  # -1: the last
+    near = sheet.points.neighbours
+    beside = (large[near] & (near >= 0)).any(axis=1)
+    share = np.bincount(label[label >= 0], beside[label >= 0], len(sizes)) / np.maximum(sizes, 1)
+    keep = (sizes >= min(LEAST, len(sheet))) & ((sizes >= smallest) | (share < 0.5))
     label = np.where(label >= 0, np.where(keep, np.cumsum(keep) - 1, -1)[np.maximum(label, 0)], -1)
     return framed(sheet, label)

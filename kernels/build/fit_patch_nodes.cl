@@ -13,7 +13,8 @@
 #ifndef COLORED
 #define COLORED 1
 #endif
-#define FRAME 20   // floats a patch: node (0, 0), unit x, y, z axes, least and largest height of own points, padding
+// Floats a patch: node (0, 0); unit x, y, z axes; least and largest height of own points; reach, widen, tolerance, slack.
+#define FRAME 18
 #define FACING 0.2f // least cosine between a point's normal and the patch's
 #define RIDGE 1e-3f // of the slopes over the reference's, so that a line of points has no slope across
 
@@ -70,7 +71,7 @@ inline int any_of_16(int16 c) {
 
 __kernel void fit_patch_nodes(int patches, int columns, int rows, int tiles_x, int tiles_y,
                               __global const float *frames,  // (patches, FRAME)
-                              float spacing, float reach, float widen, float tolerance, float slack,
+                              float spacing,
                               int padded, __global const float *sorted, __global const float *boxes,
                               __global const int *node_offset, int top_level,
                               __global const int *region,    // (padded,) patch of every point, -1 for none
@@ -85,7 +86,7 @@ __kernel void fit_patch_nodes(int patches, int columns, int rows, int tiles_x, i
   Tile t;
   t.x = (float3)(f[3], f[4], f[5]), t.y = (float3)(f[6], f[7], f[8]), t.z = (float3)(f[9], f[10], f[11]);
   t.origin = (float3)(f[0], f[1], f[2]) + spacing * ((float)first_i * t.x + (float)first_j * t.y);
-  float margin = reach;
+  float reach = f[14], widen = f[15], tolerance = f[16], slack = f[17], margin = reach;
   t.low_u = -margin, t.high_u = (TILE_W - 1) * spacing + margin;
   t.low_v = -margin, t.high_v = (TILE_H - 1) * spacing + margin;
   // The axis-aligned box of the column.
