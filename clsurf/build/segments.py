@@ -28,6 +28,9 @@ LEAST_BEND = 1e-3  # of the mesh's mean, given to every area by its size: planes
 # Times as many preliminary areas as in the end: the bunny's vertices are at most 0.057 % off its patches, 0.077 % where
 # areas are merged first and grown last, RMS the same within 5 %.
 PRELIMINARY = 2.0
+# Costs go with this power of 1 / cosine of the cone: faces that stand steeply have wide cells, and what lies beyond them
+# turns away. 8 in place of 3: a third fewer pixels outside the silhouettes of two coarse scans, a bunny as good.
+STEEP_COST = 8
 STEEP = 0.5  # cosine between a face and its area's normal below which a neighbour may suit it better
 
 
@@ -170,7 +173,7 @@ class Merging:
         cosine = np.where(area > 0, 2 * length / np.where(area > 0, area, 1) - 1, 1)
         energy = own ** 3 * (self.bend + self.least_bend * self.area)
         cost = (width ** 3 * (self.bend[a] + self.bend[b] + self.border_bend + self.least_bend * area)
-                - energy[a] - energy[b]) * np.maximum(cosine, 0.05) ** -3
+                - energy[a] - energy[b]) * np.maximum(cosine, 0.05) ** -STEEP_COST
         crease = self.border_bend > 2 * (1 - np.cos(np.radians(CREASE))) * self.border_length
         banned = (cosine < least_cosine) | (width > self.widest) | (crease & (least_cosine > -1))
         return np.where(banned, np.inf, cost)
