@@ -28,7 +28,7 @@ LEAST_BEND = 1e-3  # of the mesh's mean, given to every area by its size: planes
 # Times as many preliminary areas as in the end: the bunny's vertices are at most 0.057 % off its patches, 0.077 % where
 # areas are merged first and grown last, RMS the same within 5 %.
 PRELIMINARY = 2.0
-# Costs go with this power of 1 / cosine of the cone: faces that stand steeply have wide cells, and what lies beyond them
+# Costs go with this power of 1 / cosine of the cone: steep faces have wide cells, and what lies beyond them
 # turns away. 8 in place of 3: a third fewer pixels outside the silhouettes of two coarse scans, a bunny as good.
 STEEP_COST = 8
 STEEP = 0.5  # cosine between a face and its area's normal below which a neighbour may suit it better
