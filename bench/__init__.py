@@ -1,6 +1,7 @@
 """Benchmarks: each job checks its answer, then prints figures with the device, driver, commit and scene beside them.
 
-`clsurf bench build|tiles|normals [--json FILE]`, `clsurf bench compare A B`; `python -m bench.report FILE` runs all.
+`clsurf bench build|tiles|normals|patches [--json FILE]`, `clsurf bench compare A B`;
+`python -m bench.report FILE` runs all.
 """
 
 import importlib
@@ -9,6 +10,7 @@ JOBS = {
     "build": "scan to SLIM surface: time, size, error, overlap, memory",
     "tiles": "frames: time, time per stage and tile, holes, silhouettes, depth and normals against ray casting",
     "normals": "neighbours, normals and their orientation",
+    "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 
 

@@ -51,7 +51,7 @@ def doctor(quiet: QuietOption = False):
         raise typer.Exit(1)
 
 
-def bench(job: Annotated[str, typer.Argument(help="build, tiles, normals, or compare")],
+def bench(job: Annotated[str, typer.Argument(help="build, tiles, normals, patches, or compare")],
           files: Annotated[list[Path] | None, typer.Argument(help="compare: two JSON files.")] = None,
           json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
           quick: Annotated[bool, typer.Option(help="A small generated scene, a few seconds.")] = False,
