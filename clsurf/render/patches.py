@@ -4,7 +4,7 @@ Source: the paper on spatial patches, section 3. Kernels: kernels/render/*patch*
 """
 
 import weakref
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
+from .patch_drawing import PatchDrawing
 from .patch_lattice import CELLS, tile_lattice
-from .patch_nodes import light_nodes
+from .patch_nodes import light_nodes, table_normals
+from .patch_tiles import NODES, tile_patches
 from .shade import Look, Shading, to_linear
-from .tiles import BIN, Grid, Scratch, view_floats
+from .tiles import Grid, Scratch, view_floats
 
 FRAME_FLOATS, PATCH_FLOATS = 16, 24  # kernels/common/patch.clh
 LAYERS = (1 << 20) - 2  # kernels/render/patch_planes.clh
 LAYER_SPACINGS = 0.25  # samples of one surface within this many node spacings of depth are one layer
+LARGEST_RIM = 16383.0  # kernels/common/patch.clh
+PAD = 64  # nodes that lanes may read past the last one
 LARGEST_COUNT = (1 << 32) - 2  # a node's number is a payload of 32 bits
 
 
@@ -45,6 +49,10 @@ class PatchUpload:
     origin: NDArray  # (3,) float64
     center: NDArray  # (3,) float64, relative to origin
     reach: float  # everything lies within this of `center`
+    steps: DeviceArray  # (N + PAD,) float32: displacements
+    rims: DeviceArray  # (N + PAD,) uint16: distance to the border, and what is drawn
+    nodes: DeviceArray  # (N + PAD, 4) uint32: displacement, linear colour, slopes
+    equal_nodes: int  # nodes of every patch, 0: they differ
     surface: weakref.ref  # for what only some modes need: a strong one would keep the surface for ever
     made: dict = field(default_factory=dict)
 
@@ -53,6 +61,15 @@ class PatchUpload:
         if name not in self.made:
             self.made[name] = make(self.surface())
         return self.made[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """The patches of one surface as one camera sees them."""
+
+    records: DeviceArray  # (count, PATCH_FLOATS, with trilinear nodes 24 more) float32: kernels/common/patch.clh
+    rectangles: DeviceArray  # (count, 4) int32: first and last pixel that a patch may touch; first > last: none
+    boxes: DeviceArray  # (count, 4) int16: the same in bins
 
 
 def patch_constants(upload: PatchUpload) -> dict[str, int]:
@@ -72,7 +89,7 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
     p, nodes = len(surface), surface.node_count
     if nodes > LARGEST_COUNT:
         raise InputError(f"surface: expected at most {LARGEST_COUNT:,} nodes to draw, got {nodes:,}: split it")
-    device.check_memory(nodes=surface.displacements.nbytes + 13 * nodes, patches=4 * FRAME_FLOATS * p)
+    device.check_memory(nodes=surface.displacements.nbytes + 35 * nodes, patches=4 * FRAME_FLOATS * p)
     frames = np.zeros((max(p, 1), FRAME_FLOATS), np.float32)
     for i, values in enumerate((surface.origins, surface.axis_x, surface.axis_y, surface.axis_z)):
         frames[:p, 3 * i:3 * i + 3] = values
@@ -87,7 +104,8 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
     colors = device.upload(surface.colors.reshape(-1) if channels and nodes else np.zeros(4, np.uint8))
     sizes = device.upload(np.ascontiguousarray(surface.size))
     offsets = device.upload(surface.node_offset.astype(np.uint32))
-    frames = device.upload(frames)
+    host_frames, frames = frames, device.empty(frames.shape, np.float32)
+    device.write(frames, host_frames)
     cells, borders = device.empty(max(nodes, 1), np.uint8), device.empty(max(nodes, 1), np.float32)
     slopes = device.empty((max(nodes, 1), 2), np.float32)
     precise = surface.displacements.dtype == np.int32
@@ -95,9 +113,15 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
         (p,), None, frames, sizes, offsets, p, colors, heights, cells, borders, slopes)
     largest = float(device.download(borders, copy=False)[:nodes].max(initial=0.0)) if nodes else 0.0
     color = None if surface.color is None else to_linear(surface.color / 255)
+    linear = device.upload(to_linear(np.arange(256) / 255).astype(np.float32))
+    steps, rims = device.zeros(nodes + PAD, np.float32), device.zeros(nodes + PAD, np.uint16)
+    packed = device.zeros((nodes + PAD, 4), np.uint32)
+    device.kernel("render/pack_patches.cl", constants={"CHANNELS": channels, "PRECISE": precise})(
+        (p,), None, frames, sizes, offsets, p, colors, linear, heights, cells, borders, slopes,
+        LARGEST_RIM / max(largest, 1e-30), steps, rims, packed)
     return PatchUpload(p, channels, precise, frames, sizes, offsets, heights, colors, cells, borders, slopes,
-                       device.upload(to_linear(np.arange(256) / 255).astype(np.float32)), color, largest, spacing,
-                       surface.origin, center, reach, weakref.ref(surface))
+                       linear, color, largest, spacing, surface.origin, center, reach, steps, rims, packed,
+                       int(surface.size[0].prod()) if p and surface.equal_sizes else 0, weakref.ref(surface))
 
 
 def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, shading: Shading) -> NDArray:
@@ -119,29 +143,18 @@ def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, sha
     return view
 
 
-def project_patches(device: Device, scratch: Scratch, upload: PatchUpload,
-                    view: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-    """Return the projected patches (count, PATCH_FLOATS) and the pixels that each may touch, (count, 4) int32."""
-    records = scratch.array("patch_records", (upload.count, PATCH_FLOATS), np.float32)
+def project_patches(device: Device, scratch: Scratch, upload: PatchUpload, view: DeviceArray,
+                    drawing: PatchDrawing) -> Projected:
+    """Project the patches; find out what they may touch and how they are drawn."""
+    nodes = NODES[drawing.nodes]
+    records = scratch.array("patch_records", (upload.count, PATCH_FLOATS + 24 * (nodes > 0)), np.float32)
     rectangles = scratch.array("patch_rectangles", (upload.count, 4), np.int32)
-    device.kernel("render/project_patches.cl", constants=patch_constants(upload))(
-        (upload.count,), (min(64, upload.count),), view, upload.frames, upload.sizes, upload.count, records, rectangles)
-    return records, rectangles
-
-
-def tile_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, view: DeviceArray,
-                 records: DeviceArray, rectangles: DeviceArray, number: int, look: Look) -> None:
-    """Draw the patches of every tile into its planes; `number` is the surface's place in the scene."""
-    tile = grid.tile_bins * BIN
-    slots = scratch.array("patch_slots", (grid.tile_count, tile * tile, 2), np.uint32)
-    constants = grid.layout.constants | patch_constants(upload) | {"TILE_BINS": grid.tile_bins,
-                                                                   "TRIANGLES": look.patches.cells == "triangles"}
-    if not (grid.layout.color and look.shading.model_colors):
-        constants["CHANNELS"] = 0
-    device.kernel("render/tile_patches.cl", constants=constants)(
-        (grid.tile_count,), (1,), view, rectangles, records, upload.sizes, upload.offsets, upload.count,
-        upload.heights, upload.cells, upload.borders, upload.slopes, upload.colors, upload.linear, number,
-        grid.tiles_x, grid.tile_count, grid.bins_x, grid.bins_y, slots, grid.touched, grid.planes)
+    boxes = scratch.array("patch_boxes", (upload.count, 4), np.int16)
+    device.kernel("render/project_patches.cl", constants=patch_constants(upload) | {
+        "NODES": nodes, "DIRECT": drawing.direct})(
+        (upload.count,), (min(64, upload.count),), view, upload.frames, upload.sizes, upload.count, records, rectangles,
+        boxes)
+    return Projected(records, rectangles, boxes)
 
 
 def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, matrix, camera, look: Look,
@@ -150,7 +163,12 @@ def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUplo
     if upload.count == 0:
         return
     view = device.upload(place_patches(upload, matrix, camera, grid.size, look.shading))
-    records, rectangles = project_patches(device, scratch, upload, view)
+    projected = project_patches(device, scratch, upload, view, look.patches)
+    rectangles = projected.rectangles
+    if look.patches.normal_table:
+        slopes, _ = table_normals(device, scratch, upload, patch_constants(upload), rectangles,
+                                  look.patches.normal_table)
+        upload = replace(upload, slopes=slopes)
     constants = grid.layout.constants | patch_constants(upload)
     if not (grid.layout.color and look.shading.model_colors):
         constants["CHANNELS"] = 0
@@ -158,6 +176,7 @@ def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUplo
     if grid.layout.lit:
         lit = light_nodes(device, scratch, upload, constants, view, look.lamps, rectangles, upload.slopes)
     if look.patches.cells in CELLS:
-        tile_lattice(device, scratch, grid, upload, constants, view, records, rectangles, lit, number, look.patches)
+        tile_lattice(device, scratch, grid, upload, constants, view, projected.records, rectangles, lit, number,
+                     look.patches)
     else:
-        tile_patches(device, scratch, grid, upload, view, records, rectangles, number, look)
+        tile_patches(device, scratch, grid, upload, constants, view, projected, number, look.patches)

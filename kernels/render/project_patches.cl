@@ -1,20 +1,45 @@
-// The linear forms that project the nodes of every patch, and the pixels that it may touch. One work-item per patch.
-// Twin: tests/reference/render_patches.py, project_patches.
+// The linear forms that project the nodes of every patch, the pixels and bins that it may touch, and how it is drawn. One
+// work-item per patch. Twin: tests/reference/render_patches.py, project_patches.
 //
 // The rectangle (first x, first y, last x, last y; first > last: not in the picture) is that of the eight corners of the
 // box around the patch's displacements; a patch that reaches the near plane gets the whole picture.
 #include "common/patch.clh"
+#include "common/bins.clh"
+
+#ifndef NODES
+#define NODES 0   // 0: exact projection; 1: trilinear from the box's corners, 2: the same before the division
+#endif
+#ifndef DIRECT
+#define DIRECT 0  // 1: patches of cells smaller than a pixel are drawn node by node
+#endif
+#ifndef LARGE_PX
+#define LARGE_PX 12.0f  // a cell may be this wide or high before lanes are pixels of a cell instead of cells of a row
+#endif
+#define PATCH_STRIDE (NODES ? PATCH_FLOATS + 24 : PATCH_FLOATS)
+
+#if NODES
+// The polynomial through the values v at the corners of a box (bits: i, j, d) of size (m, n, e) from (0, 0, low).
+inline void trilinear(const float *v, float m, float n, float low, float e, __global float *out) {
+  float c = v[0], x = (v[1] - v[0]) / m, y = (v[2] - v[0]) / n, z = (v[4] - v[0]) / e;
+  float xy = (v[3] - v[2] - v[1] + v[0]) / (m * n), xz = (v[5] - v[4] - v[1] + v[0]) / (m * e);
+  float yz = (v[6] - v[4] - v[2] + v[0]) / (n * e);
+  float xyz = (v[7] - v[6] - v[5] - v[3] + v[4] + v[2] + v[1] - v[0]) / (m * n * e);
+  // In displacements d, not d - low.
+  out[0] = c - low * z; out[1] = x - low * xz; out[2] = y - low * yz; out[3] = z;
+  out[4] = xy - low * xyz; out[5] = xz; out[6] = yz; out[7] = xyz;
+}
+#endif
 
 inline void turned(__global const float *view, __global const float *v, float *out) {
   for (int r = 0; r < 3; r++) out[r] = view[3 * r] * v[0] + view[3 * r + 1] * v[1] + view[3 * r + 2] * v[2];
 }
 
 __kernel void project_patches(__global const float *view, __global const float *frames, __global const int *sizes,
-                              int count, __global float *records, __global int4 *rectangles) {
+                              int count, __global float *records, __global int4 *rectangles, __global short4 *boxes) {
   int k = get_global_id(0);
   if (k >= count) return;
   __global const float *f = frames + (size_t)k * FRAME_FLOATS;
-  __global float *h = records + (size_t)k * PATCH_FLOATS;
+  __global float *h = records + (size_t)k * PATCH_STRIDE;
   int perspective = view[PERSPECTIVE] > 0.0f;
   float scale = view[SCALE], v[3];
   for (int part = 0; part < 4; part++) {
@@ -35,18 +60,48 @@ __kernel void project_patches(__global const float *view, __global const float *
     turned(view, f + (part ? 3 * part : AXIS_Z), v);
     h[NX + part] = v[0] * share[part]; h[NY + part] = v[1] * share[part]; h[NZ + part] = v[2] * share[part];
   }
-  float low = f[LOW_STEP], high = f[HIGH_STEP], near = view[NEAR];
+  float low = f[LOW_STEP], high = f[HIGH_STEP], near = view[NEAR], m = sizes[2 * k] - 1, n = sizes[2 * k + 1] - 1;
   float x0 = INFINITY, y0 = INFINITY, x1 = -INFINITY, y1 = -INFINITY, front = INFINITY, back = -INFINITY;
+#if NODES
+  float extent = high > low ? high - low : 1.0f, corners[3][8];
+#endif
   for (int corner = 0; corner < 8; corner++) {
-    Node p = node_at(h, perspective, corner & 1 ? sizes[2 * k] - 1 : 0, corner & 2 ? sizes[2 * k + 1] - 1 : 0,
-                     corner & 4 ? high : low);
+#if NODES
+    high = low + extent;
+#endif
+    Node p = node_at(h, perspective, corner & 1 ? m : 0, corner & 2 ? n : 0, corner & 4 ? high : low);
     front = fmin(front, p.z); back = fmax(back, p.z);
-    x0 = fmin(x0, p.x / p.w); x1 = fmax(x1, p.x / p.w); y0 = fmin(y0, p.y / p.w); y1 = fmax(y1, p.y / p.w);
+    float inv = 1.0f / p.w;
+    x0 = fmin(x0, p.x * inv); x1 = fmax(x1, p.x * inv); y0 = fmin(y0, p.y * inv); y1 = fmax(y1, p.y * inv);
+#if NODES
+    corners[0][corner] = NODES == 1 ? p.x * inv : p.x; corners[1][corner] = NODES == 1 ? p.y * inv : p.y;
+    corners[2][corner] = p.z;
+#endif
   }
-  if (front <= near || (perspective && front <= 1e-4f * back)) { x0 = y0 = -1e9f; x1 = y1 = 1e9f; }
+  int clipped = front <= near || (perspective && front <= 1e-4f * back), flags = clipped ? PATCH_CLIPPED : 0;
+#if NODES
+  for (int r = 0; r < 3; r++) trilinear(corners[r], m, n, low, extent, h + PATCH_FLOATS + 8 * r);
+#endif
+  if (clipped) { x0 = y0 = -1e9f; x1 = y1 = 1e9f; }
+  else {
+    // The sides of a cell in pixels: from node a to b, x changes by (change of x w - x_b change of w) / w_a.
+    float inv = perspective ? 1.0f / front : 1.0f, turn = perspective ? 1.0f : 0.0f, wide = 0.0f, tall = 0.0f;
+    for (int side = 1; side < 3; side++) {
+#define CHANGE(H, at) (fabs(h[H + side] - at * turn * h[HZ + side]) + f[LARGEST_STEP] * fabs(h[H + 3] - at * turn * h[HZ + 3]))
+      wide += inv * fmax(CHANGE(HX, x0), CHANGE(HX, x1));
+      tall += inv * fmax(CHANGE(HY, y0), CHANGE(HY, y1));
+    }
+    if (DIRECT && wide <= 1.0f && tall <= 1.0f) flags = PATCH_DIRECT;
+    if (wide > LARGE_PX || tall > LARGE_PX) flags = PATCH_LARGE;
+  }
+  h[PATCH_FLAGS] = as_float(flags);
+  h[PATCH_NEAR] = front > near ? front : near;
+  h[SLOPE_SCALE] = f[SCALE_OF_SLOPES];
   // 1/32 pixel covers float rounding.
   x0 = fmax(ceil(x0 - 0.53125f), 0.0f); x1 = fmin(floor(x1 - 0.46875f), view[WIDTH] - 1.0f);
   y0 = fmax(ceil(y0 - 0.53125f), 0.0f); y1 = fmin(floor(y1 - 0.46875f), view[HEIGHT] - 1.0f);
-  int shown = low <= high && back > near && x0 <= x1 && y0 <= y1;
+  int shown = f[LOW_STEP] <= f[HIGH_STEP] && back > near && x0 <= x1 && y0 <= y1;
   rectangles[k] = shown ? (int4)((int)x0, (int)y0, (int)x1, (int)y1) : (int4)(1, 1, 0, 0);
+  boxes[k] = shown ? (short4)((short)(x0 / BIN), (short)(y0 / BIN), (short)(x1 / BIN), (short)(y1 / BIN))
+                   : (short4)(32767, 32767, -1, -1);
 }
