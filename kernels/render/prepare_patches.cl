@@ -2,17 +2,6 @@
 // drawn, and the slopes of the surface at the nodes. Twin: tests/reference/render_patches.py, prepare_patches.
 #include "common/patch.clh"
 
-inline int opaque(__global const uchar *colors, __global const height_t *heights, uint node) {
-#if CHANNELS == 4
-  return colors[4 * (size_t)node + 3] != 0;
-#elif CHANNELS == 3
-  __global const uchar *c = colors + 3 * (size_t)node;
-  return (c[0] | c[1] | c[2]) != 0;
-#else
-  return heights[node] != (PRECISE ? (height_t)0x80000000 : (height_t)-128);
-#endif
-}
-
 // Slope at a node along one direction: central where both neighbours show, else one-sided.
 inline float slope(int before, int after, float low, float here, float high) {
   if (before && after) return 0.5f * (high - low);
