@@ -73,6 +73,7 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     method = _method_of(scan) if method is None else method
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    scan = _fitting(scan, method)
     module = importlib.import_module(f"{__package__}.{METHODS[method]}")
     return module.convert(scan, request, open_device(device), _step(progress))
 
@@ -83,6 +84,15 @@ def _step(progress):
         if progress is not None and progress(what, fraction) is False:
             raise Cancelled("build_patches: stopped by the progress callback")
     return step
+
+
+def _fitting(scan, method):
+    """Return what `method` takes: range images as points where it wants points. Raise InputError where nothing fits."""
+    if method == "ranges" and not hasattr(scan, "images"):
+        raise InputError(f"method ranges: expected range images, got a {type(scan).__name__}: use local")
+    if method == "areas" and not (isinstance(scan, Mesh) and len(scan.faces)):
+        raise InputError("method areas: expected a mesh with faces, got none: use local")
+    return scan.to_points() if method in ("local", "global_views") and hasattr(scan, "images") else scan
 
 
 def _loaded(path):
