@@ -42,8 +42,6 @@ class Recipe:
         import clsurf
         if self.kind_for(scan) == "patches":
             return clsurf.build_patches(scan, **self.patches, device=device, progress=steps.progress)
-        if hasattr(scan, "images"):
-            raise InputError(f"kind: expected patches for range images, got slim ({scan!r})")
         return clsurf.build_slim(scan, **self.slim, device=device, progress=steps.progress)
 
 
@@ -92,8 +90,8 @@ def parsed_error(text: str, kind: str = "slim") -> float | str:
 
 def parsed_nodes(text: str) -> tuple[int, int]:
     """Return the nodes along both axes of a text such as 17 or 17x9."""
-    m, _, n = text.lower().partition("x")
-    n = n or m
+    m, two, n = text.lower().partition("x")
+    n = n if two else m
     if not (m.isdecimal() and n.isdecimal()):
         raise InputError(f"nodes: expected a number such as 17, or two such as 17x9, got {text!r}")
     return int(m), int(n)

@@ -18,7 +18,8 @@ section { background: var(--card); border: 1px solid var(--line); border-radius:
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 0 0 .8rem; }
 th, td { padding: .22rem .8rem .22rem 0; text-align: left; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-weight: 600; white-space: nowrap; }
+th { font-weight: 600; }
+.facts th { white-space: nowrap; }
 .numbers td, .numbers thead th:not(:first-child) { text-align: right; padding: .22rem 0 .22rem 1.4rem;
   white-space: nowrap; }
 .facts { width: 100%; }
