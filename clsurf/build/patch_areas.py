@@ -245,8 +245,9 @@ def _with_bound(found: Conversion, diagonal: float) -> PatchSurface:
     chosen = np.arange(len(graph.vertices))[::max(1, len(graph.vertices) // BOUND_SAMPLES)]
     patch = found.owner[_face_of_vertices(graph)[chosen]]
     upper, _ = patch_distances(found.surface, patch, graph.vertices[chosen])
-    return replace(found.surface, diagonal=diagonal, bound=float(np.quantile(upper, BOUND_SHARE)),
-                   bound_share=BOUND_SHARE)
+    upper = upper[np.isfinite(upper)]  # the others' patches are wholly transparent, as the scan is there
+    bound = float(np.quantile(upper, BOUND_SHARE, method="higher")) if len(upper) else float("nan")
+    return replace(found.surface, diagonal=diagonal, bound=bound, bound_share=BOUND_SHARE)
 
 
 def _rms(found: Conversion) -> float:
