@@ -3,6 +3,7 @@
 The public names on one screen; every other name is private to the package.
 """
 
+from . import interrupt  # noqa: F401, I001  first: the other imports take a second
 from . import errors, models
 from .build.normals import estimate_normals
 from .build.patches import build_patches

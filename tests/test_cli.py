@@ -132,6 +132,15 @@ def test_ctrl_c_is_exit_code_130_and_leaves_nothing(tmp_path, on_device):
     assert os.listdir(tmp_path) == ["large.npy"]
 
 
+def test_ctrl_c_while_importing_is_one_line(tmp_path):
+    """A module that Ctrl-C stops at, in place of one that clsurf imports."""
+    (tmp_path / "zarr.py").write_text("raise KeyboardInterrupt")
+    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    done = subprocess.run([sys.executable, "-m", "clsurf", "devices"], capture_output=True, text=True,
+                          env=os.environ | {"PYTHONPATH": path})
+    assert done.stderr == "clsurf: stopped\n" and done.returncode in (-signal.SIGINT, 130)
+
+
 def test_a_device_that_is_not_there(capsys, monkeypatch):
     monkeypatch.setenv("CLSURF_DEVICE", "nonsense")
     assert main(["devices"]) == 2
