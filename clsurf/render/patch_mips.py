@@ -4,6 +4,8 @@ The paper names mip-mapping-like filtering as future work (section 6). A level i
 same patches in the same order, so that every mode draws it.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,11 +36,9 @@ def halved(surface: PatchSurface) -> PatchSurface:
     channels = 1 if surface.colors is None else 1 + surface.colors.shape[1]
     offset = np.concatenate([[0], np.cumsum(coarse.prod(axis=1))])
     values, cover = np.zeros((offset[-1], channels)), np.zeros(offset[-1])
-    for m, n in np.unique(size, axis=0):  # all patches of one size at once
-        which = np.flatnonzero((size == (m, n)).all(axis=1))
-        whole = len(which) == len(surface)
-        nodes = slice(None) if whole else (surface.node_offset[which][:, None] + np.arange(m * n)).ravel()
-        out = slice(None) if whole else (offset[which][:, None] + np.arange(((m + 2) // 2) * ((n + 2) // 2))).ravel()
+    for which, nodes, m, n in by_size(surface):
+        out = slice(None) if len(which) == len(surface) else \
+            (offset[which][:, None] + np.arange(((m + 2) // 2) * ((n + 2) // 2))).ravel()
         values[out], cover[out] = _averaged(surface, nodes, m, n)
     kind = surface.displacements.dtype
     opaque, least = cover >= 0.5, np.iinfo(kind).min
@@ -48,6 +48,14 @@ def halved(surface: PatchSurface) -> PatchSurface:
     return PatchSurface(
         surface.origins, surface.axis_x * scale[:, :1], surface.axis_y * scale[:, 1:], surface.axis_z_length, coarse, d,
         colors, surface.color, surface.origin, surface.diagonal, surface.bound, surface.bound_share, surface.oriented)
+
+
+def by_size(surface: PatchSurface) -> Iterator[tuple[NDArray, NDArray | slice, int, int]]:
+    """Yield (patches, an index of all their nodes, m, n) for every size that patches have."""
+    for m, n in np.unique(surface.size, axis=0).astype(np.int64):
+        which = np.flatnonzero((surface.size == (m, n)).all(axis=1))
+        whole = len(which) == len(surface)
+        yield which, slice(None) if whole else (surface.node_offset[which][:, None] + np.arange(m * n)).ravel(), m, n
 
 
 def tent(nodes: int) -> NDArray:

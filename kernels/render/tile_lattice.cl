@@ -371,7 +371,6 @@ INLINE int resolve_block(__global const float *view, __global const uint2 *slots
   hit = hit & (depth > view[NEAR]);
   VI closer = hit & (depth < before);
   store_plane(planes, FIELD_DEPTH, at_pixel, SEL(before, depth, closer));
-  s = VMAX(s, (VF)(0.0f)); s = VMIN(s, (VF)(1.0f)); t = VMAX(t, (VF)(0.0f)); t = VMIN(t, (VF)(1.0f));
 #if CURVED
   smooth_height(&c, s, t, &gs, &gt);
 #else
@@ -386,6 +385,8 @@ INLINE int resolve_block(__global const float *view, __global const uint2 *slots
   merge_plane(planes, FIELD_NORMAL + 1, at_pixel, side * ny, closer);
   merge_plane(planes, FIELD_NORMAL + 2, at_pixel, side * nz, closer);
 #if FIELD_COLOR >= 0
+  // Depth and normals are carried on beyond the cell, colours are not: they could leave their range.
+  s = VMAX(s, (VF)(0.0f)); s = VMIN(s, (VF)(1.0f)); t = VMAX(t, (VF)(0.0f)); t = VMIN(t, (VF)(1.0f));
   for (int k = 0; k < 3; k++) {
 #if LIT_NODES || CHANNELS
     VF corner[4];
