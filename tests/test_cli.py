@@ -134,7 +134,7 @@ def test_ctrl_c_is_exit_code_130_and_leaves_nothing(tmp_path, on_device):
 
 def test_ctrl_c_while_importing_is_one_line(tmp_path):
     """A module that Ctrl-C stops at, in place of one that clsurf imports."""
-    (tmp_path / "zarr.py").write_text("raise KeyboardInterrupt")
+    (tmp_path / "numpy.py").write_text("raise KeyboardInterrupt")
     path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
     done = subprocess.run([sys.executable, "-m", "clsurf", "devices"], capture_output=True, text=True,
                           env=os.environ | {"PYTHONPATH": path})
