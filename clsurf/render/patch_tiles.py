@@ -3,21 +3,26 @@
 import numpy as np
 
 from ..device import Device, DeviceArray
-from .patch_drawing import PatchDrawing
-from .shade import CHANNELS
+from .shade import CHANNELS, Look
 from .tiles import Grid, Scratch
 
 NODES = {"exact": 0, "trilinear": 1, "homogeneous": 2}  # kernels/render/patch_cells.clh
 
 
 def tile_patches(device: Device, scratch: Scratch, grid: Grid, upload, constants: dict, view: DeviceArray, projected,
-                 number: int, drawing: PatchDrawing) -> None:
-    """Draw the patches of every tile into its planes; `number` is the surface's place in the scene."""
+                 number: int, look: Look, out: dict[str, DeviceArray] | None = None) -> None:
+    """Draw the patches of every tile into its planes, or, given the channels `out`, shade them into the picture.
+
+    `number` is the surface's place in the scene.
+    """
     group = 64 if scratch.lanes == 1 else 1
-    constants = constants | {"VW": scratch.lanes, "TILE_BINS": grid.tile_bins, "NODES": NODES[drawing.nodes],
-                             "TRIANGLES": drawing.cells == "triangles", "EQUAL_NODES": upload.equal_nodes}
+    constants = constants | {
+        "VW": scratch.lanes, "TILE_BINS": grid.tile_bins, "NODES": NODES[look.patches.nodes],
+        "TRIANGLES": look.patches.cells == "triangles", "EQUAL_NODES": upload.equal_nodes, "FUSED": out is not None,
+        "COUNT_COST": look.cost or (out is not None and "cost" in out)}
     unused = scratch.array("unused", (4,), np.float32)
+    channels = out or {}
     device.kernel("render/tile_patches.cl", constants=constants)(
         (grid.tile_count * group,), (group,), view, projected.boxes, projected.records, upload.sizes, upload.offsets,
         upload.count, upload.steps, upload.rims, upload.nodes, number, grid.tiles_x, grid.tile_count, grid.bins_x,
-        grid.bins_y, grid.touched, grid.planes, *(unused for _ in CHANNELS))
+        grid.bins_y, grid.touched or unused, grid.planes or unused, *(channels.get(name, unused) for name in CHANNELS))

@@ -16,7 +16,7 @@ from .patch_drawing import PatchDrawing
 from .patch_lattice import CELLS, tile_lattice
 from .patch_nodes import light_nodes, table_normals
 from .patch_tiles import NODES, tile_patches
-from .shade import Look, Shading, to_linear
+from .shade import Look, Shading, new_channels, shade_constants, to_linear
 from .tiles import Grid, Scratch, view_floats
 
 FRAME_FLOATS, PATCH_FLOATS = 16, 24  # kernels/common/patch.clh
@@ -179,4 +179,28 @@ def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUplo
         tile_lattice(device, scratch, grid, upload, constants, view, projected.records, rectangles, lit, number,
                      look.patches)
     else:
-        tile_patches(device, scratch, grid, upload, constants, view, projected, number, look.patches)
+        tile_patches(device, scratch, grid, upload, constants, view, projected, number, look)
+
+
+def shades_at_once(drawing: PatchDrawing) -> bool:
+    """Return whether a frame of one surface drawn like this can be shaded by its tile stage."""
+    return (drawing.cells not in CELLS and drawing.shading == "pixel" and drawing.normals == "bilinear"
+            and not drawing.normal_table and not drawing.alpha)
+
+
+def shade_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, matrix, camera, look: Look,
+                  whole: NDArray, lamps: NDArray, channels) -> dict[str, DeviceArray]:
+    """Draw a frame of one surface, from projection to shading, without planes; return its channels on the device.
+
+    `whole` is the view buffer of the frame, `lamps` the shading buffer.
+    """
+    floats = np.concatenate([place_patches(upload, matrix, camera, grid.size, look.shading), whole, lamps])
+    view = device.upload(floats)
+    projected = project_patches(device, scratch, upload, view, look.patches)
+    constants = grid.layout.constants | patch_constants(upload)
+    if not (grid.layout.color and look.shading.model_colors):
+        constants["CHANNELS"] = 0
+    out = new_channels(device, grid.size, channels)
+    constants |= shade_constants(grid, look.shading.look != "flat", channels)
+    tile_patches(device, scratch, grid, upload, constants, view, projected, 0, look, out)
+    return out

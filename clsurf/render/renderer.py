@@ -13,7 +13,7 @@ from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .frame import Frame
 from .patch_drawing import PatchDrawing
-from .patches import draw_patches, upload_patches
+from .patches import draw_patches, shade_patches, shades_at_once, upload_patches
 from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
@@ -115,12 +115,22 @@ class Renderer:
         own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
         try:
             # The stages of a frame.
-            grid = self._new_grid(scene, size, channels, shading, patches)
-            lamps = self.device.upload(shading_floats(shading, scene.lights, background, camera))
-            for number, (surface, matrix) in enumerate(scene.placed):
-                self._draw(grid, number, surface, matrix, camera, Look(shading, lod, patches, lamps))
-            origin = scene_origin(scene)
-            arrays = self._shade(grid, camera, origin, lamps, shading, channels)
+            placed, origin = scene.placed, scene_origin(scene)
+            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and shades_at_once(patches)
+            grid = self._new_grid(placed, size, channels, shading, patches, planes=not at_once)
+            floats = shading_floats(shading, scene.lights, background, camera)
+            whole = view_floats(camera, size, offset=camera.eye - origin)
+            if at_once:
+                (surface, matrix), look = placed[0], Look(shading, lod, patches)
+                arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
+                                       whole, floats, channels)
+            else:
+                lamps = self.device.upload(floats)
+                for number, (surface, matrix) in enumerate(placed):
+                    KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
+                                            Look(shading, lod, patches, lamps, "cost" in channels), number)
+                arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
+                               shading.look != "flat", channels)
             if factor > 1:
                 arrays = average(self.device, arrays, picture, factor, wanted, self._scratch.lanes)
             return Frame({name: self.device.download(array, copy=False) for name, array in arrays.items()}, origin,
@@ -132,36 +142,32 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, scene, size, channels, shading, patches) -> Grid:
-        """Return bins that nothing has touched yet."""
+    def _new_grid(self, placed, size, channels, shading, patches, planes: bool) -> Grid:
+        """Return bins that nothing has touched yet; without `planes` only their places."""
         colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
-                                               for s, _ in scene.placed)
+                                               for s, _ in placed)
         colored |= shading.look.startswith("ball")
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look != "flat" and "color" in channels
-        lit &= any(isinstance(s, PatchSurface) for s, _ in scene.placed)
+        lit &= any(isinstance(s, PatchSurface) for s, _ in placed)
         layout = Layout(color=(colored or lit) and "color" in channels, id="id" in channels, count="count" in channels,
                         level="level" in channels, lit=lit)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
-        self.device.check_memory(planes=4 * 64 * fields * bins,
+        self.device.check_memory(planes=4 * 64 * fields * bins * planes,
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
+        if not planes:
+            return Grid(size, self.tile_bins, layout, None, None)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
         return Grid(size, self.tile_bins, layout, touched,
                     self._scratch.array("planes", (bins, fields, 64), np.float32))
 
-    def _draw(self, grid, number, surface, matrix, camera, look) -> None:
-        put, draw = KINDS[type(surface)]
+    def _uploaded(self, surface):
         upload = self._uploads.get(surface)
         if upload is None:
-            upload = self._uploads[surface] = put(self.device, surface)
-        draw(self.device, self._scratch, grid, upload, matrix, camera, look, number)
-
-    def _shade(self, grid, camera, origin, lamps, shading, channels):
-        offset = camera.eye - origin
-        view = self.device.upload(view_floats(camera, grid.size, offset=offset))
-        return shade(self.device, self._scratch, grid, view, lamps, shading.look != "flat", channels)
+            upload = self._uploads[surface] = KINDS[type(surface)][0](self.device, surface)
+        return upload
 
     def close(self) -> None:
         """Give all device memory back; the renderer cannot be used afterwards. May be called twice."""

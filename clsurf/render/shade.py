@@ -99,7 +99,8 @@ class Look:
     shading: Shading
     lod: float
     patches: PatchDrawing
-    lamps: DeviceArray  # the shading buffer, for what is lit before the last stage
+    lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
+    cost: bool = False  # whether the frame wants the costs of bins
 
 
 def to_linear(srgb):
@@ -139,14 +140,20 @@ def shade_constants(grid: Grid, lit: bool, channels) -> dict[str, int]:
         "LIT": lit, "STREAMED": 4 * pixels > STREAMED_BYTES}
 
 
+def new_channels(device: Device, size: tuple[int, int], channels) -> dict[str, DeviceArray]:
+    """Return room for the channels of a picture by name."""
+    out = {}
+    for name in channels:
+        parts, dtype = CHANNELS[name]
+        out[name] = device.empty((size[1], size[0], parts) if parts else (size[1], size[0]), dtype)
+    return out
+
+
 def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps: DeviceArray, lit: bool,
           channels) -> dict[str, DeviceArray]:
     """Write the channels of the picture from the grid's planes; return them by name, on the device."""
     width, height = grid.size
-    out = {}
-    for name in channels:
-        parts, dtype = CHANNELS[name]
-        out[name] = device.empty((height, width, parts) if parts else (height, width), dtype)
+    out = new_channels(device, grid.size, channels)
     constants = grid.layout.constants | {"VW": scratch.lanes, "SPAN": SPAN} | shade_constants(grid, lit, channels)
     items = (width, height) if scratch.lanes == 1 else (-(-width // SPAN), -(-height // BIN))
     unused = scratch.array("unused", (4,), np.float32)

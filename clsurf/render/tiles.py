@@ -44,8 +44,8 @@ class Grid:
     size: tuple[int, int]  # (width, height), pixels
     tile_bins: int  # a tile is tile_bins x tile_bins bins
     layout: Layout
-    touched: DeviceArray  # (bins,) int32: pixel evaluations of the tile stages, -1 where nothing came
-    planes: DeviceArray  # (bins, FIELDS, 64) float32
+    touched: DeviceArray | None  # (bins,) int32: pixel evaluations of the tile stages, -1 where nothing came
+    planes: DeviceArray | None  # (bins, FIELDS, 64) float32; None where the picture is shaded without them
 
     @property
     def bins_x(self) -> int:
