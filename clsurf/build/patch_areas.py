@@ -13,13 +13,16 @@ from ..errors import InputError
 from ..io.cleaning import first_of_duplicates
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
+from .patch_edges import ALONG
 from .patch_error import patch_distances
+from .patch_strips import cells_beside, cut_graph, fitting_strips, joined, strip_faces, strip_frames
 from .quantize import quantized
-from .resample import REACH, Frames, area_lists, resample_faces
+from .resample import REACH, FaceLists, Frames, area_lists, has_colors, resample_faces
 from .segments import FaceGraph, face_graph, partition, split_faces
 
 NODES_A_VERTEX = 441_014 / 34_834  # of the paper's bunny (Table 1): the mesh's own resolution
 ANGLES = 12  # within 90 degrees, that rectangles around areas are tried at
+UNFILLED = 1.3  # spacing over that of patches that areas fill whole; areas fill 0.6 of them
 LONGEST_EDGE = 0.5  # of a patch's width: larger faces are cut, so that areas can end within them
 WIDEST = 0.95  # of what a patch spans: widths along segments.DIRECTIONS fall short of those of the rectangle
 BOUND_SHARE = 0.999  # of the mesh's vertices lie within `bound` of the patches
@@ -35,13 +38,14 @@ class Conversion:
     surface: PatchSurface
     graph: FaceGraph
     owner: NDArray  # (f,) int64
+    beside: FaceLists  # faces of the strips along sharp edges, which are the last patches
 
 
 def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
     """Return the patches of a mesh: exactly `request.patches`, or of `request.spacing`, or as good as `request.error`.
 
     With none of them the number of nodes goes with that of vertices, as in the paper's Table 1; more patches are made
-    where cones, creases and separate parts of the mesh ask for them.
+    where cones, creases and separate parts of the mesh ask for them. The strips along sharp edges count as patches.
 
     Raises
     ------
@@ -78,16 +82,27 @@ def converted(mesh: Mesh, request, device, progress) -> Conversion:
     graph = face_graph(vertices, corners)
     if request.patches:
         _check_count(graph, request.patches)
+    strips = fitting_strips(graph, request.nodes, request.spacing or UNFILLED * width / spans.min(),
+                            None if request.spacing else count, 1.0 if has_colors(mesh) else ALONG)
+    marked = np.zeros(len(graph.vertices), bool)
+    marked[strips.edges.ends] = True
+    graph = cut_graph(graph, strips) if len(strips) else graph
     widest = WIDEST * width if request.spacing else np.inf
-    owner, count = partition(graph, 1 if request.spacing else count, widest, exact=bool(request.patches),
-                             step=lambda: progress(0.5, "areas"))
+    count = 1 if request.spacing else max(1, count - len(strips))
+    owner, count = partition(graph, count, widest, exact=bool(request.patches), step=lambda: progress(0.5, "areas"))
     frames, owner = framed(graph, owner, count, request.nodes, request.spacing)
     progress(0.0, "nodes")
-    heights, colors, _ = resample_faces(device, mesh, frames, area_lists(owner, len(frames), corners), request.precise)
+    lists = area_lists(owner, len(frames), graph.corners)
+    along = strip_frames(strips, cells_beside(strips, frames, owner), request.nodes)
+    under = strip_faces(graph, strips, along)
+    frames, lists = joined(frames, lists, along, under)
+    cut = np.zeros(len(mesh.vertices), np.uint8)
+    cut[mesh.faces[marked[corners]]] = 1
+    heights, colors, _ = resample_faces(device, mesh, frames, lists, request.precise, cut=cut)
     surface = quantized(frames.origins, frames.axis_x, frames.axis_y, heights, frames.size, colors, request.precise,
                         origin=mesh.origin)
     progress(1.0, "nodes")
-    return Conversion(surface, graph, owner)
+    return Conversion(surface, graph, owner, under)
 
 
 def _check_count(graph: FaceGraph, patches: int) -> None:
@@ -240,11 +255,29 @@ def _face_of_vertices(graph: FaceGraph) -> NDArray:
     return face
 
 
+def _distances(found: Conversion, face: NDArray, points: NDArray) -> tuple[NDArray, NDArray]:
+    """Return patch_distances of points on the faces `face`: to their area's patch or a nearer strip."""
+    strips, listed = len(found.beside.own), found.beside.faces
+    strip = np.repeat(np.arange(strips), found.beside.own) + len(found.surface) - strips
+    order = np.argsort(listed, kind="stable")
+    first, last = (np.searchsorted(listed[order], face, side=side) for side in ("left", "right"))
+    row = np.repeat(np.arange(len(face)), last - first)
+    at = np.arange(len(row)) - np.repeat(np.cumsum(last - first) - last, last - first)
+    rows = np.concatenate([np.arange(len(face)), row])
+    patch = np.concatenate([found.owner[face], strip[order[at]]])
+    best = np.full((2, len(face)), np.inf)
+    for to_nodes in (False, True):  # nodes only for the few points that no cell lies over
+        left = np.flatnonzero(~np.isfinite(best[0, rows]))
+        for mine, theirs in zip(best, patch_distances(found.surface, patch[left], points[rows[left]], to_nodes),
+                                strict=True):
+            np.minimum.at(mine, rows[left], theirs)
+    return best[0], best[1]
+
+
 def _with_bound(found: Conversion, diagonal: float) -> PatchSurface:
     graph = found.graph
     chosen = np.arange(len(graph.vertices))[::max(1, len(graph.vertices) // BOUND_SAMPLES)]
-    patch = found.owner[_face_of_vertices(graph)[chosen]]
-    upper, _ = patch_distances(found.surface, patch, graph.vertices[chosen])
+    upper, _ = _distances(found, _face_of_vertices(graph)[chosen], graph.vertices[chosen])
     upper = upper[np.isfinite(upper)]  # the others' patches are wholly transparent, as the scan is there
     bound = float(np.quantile(upper, BOUND_SHARE, method="higher")) if len(upper) else float("nan")
     return replace(found.surface, diagonal=diagonal, bound=bound, bound_share=BOUND_SHARE)
@@ -257,7 +290,7 @@ def _rms(found: Conversion) -> float:
     faces = np.arange(len(graph))[::step]
     total = weight = 0.0
     for points in (graph.middle[faces], *(graph.vertices[graph.corners[faces, k]] for k in range(3))):
-        _, near = patch_distances(found.surface, found.owner[faces], points)
+        _, near = _distances(found, faces, points)
         total, weight = total + (graph.area[faces] * near ** 2).sum(), weight + graph.area[faces].sum()
     return math.sqrt(total / max(weight, 1e-300))
 

@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from ..surface.patch import PatchSurface
 
 
-def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray) -> tuple[NDArray, NDArray]:
+def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray,
+                    to_nodes: bool = True) -> tuple[NDArray, NDArray]:
     """Return distances from points to patches that cover them.
 
     Parameters
@@ -15,6 +16,8 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray) -> t
         Patch of every point.
     points : (n, 3) float64
         Relative to the surface's origin.
+    to_nodes : bool
+        Measure points whose cell is not opaque to the patch's nodes; otherwise they are at inf.
 
     Returns
     -------
@@ -41,7 +44,7 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray) -> t
     slope_y = ((1 - u) * (d[2] - d[0]) + u * (d[3] - d[1])) * lengths[2] / lengths[1]
     near = upper / np.sqrt(1 + slope_x ** 2 + slope_y ** 2)
     outside = np.flatnonzero(~inside)
-    upper[outside] = near[outside] = _to_nodes(surface, patch[outside], points[outside])
+    upper[outside] = near[outside] = _to_nodes(surface, patch[outside], points[outside]) if to_nodes else np.inf
     return upper, near
 
 

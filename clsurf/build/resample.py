@@ -47,7 +47,8 @@ class FaceLists:
 
 
 def resample_faces(device, mesh: Mesh, frames: Frames, lists: FaceLists, precise: bool = False,
-                   reach: float = REACH) -> tuple[NDArray, NDArray | None, NDArray]:
+                   reach: float = REACH,
+                   cut: NDArray | None = None) -> tuple[NDArray, NDArray | None, NDArray]:
     """Project faces orthogonally onto the nodes of patches.
 
     Parameters
@@ -64,6 +65,8 @@ def resample_faces(device, mesh: Mesh, frames: Frames, lists: FaceLists, precise
     reach : float
         Half the side, in node steps, of the square around a needed node that meets an own face; 1: exactly the
         corners of the cells that own faces meet.
+    cut : (v,) uint8, optional
+        1: a vertex on an edge that own faces are not carried on over (patch_strips.py).
 
     Returns
     -------
@@ -79,6 +82,7 @@ def resample_faces(device, mesh: Mesh, frames: Frames, lists: FaceLists, precise
     The paper on spatial patches, section 4.1.
     """
     count, offset = len(frames), frames.node_offset
+    cut = np.zeros(len(mesh.vertices), np.uint8) if cut is None else cut
     nodes = int(offset[-1])
     if not nodes:
         return np.zeros(0), None, np.zeros(0, np.int32)
@@ -89,7 +93,8 @@ def resample_faces(device, mesh: Mesh, frames: Frames, lists: FaceLists, precise
     kernel = device.kernel("build/resample_heights.cl", constants={"REACH": f"{float(reach)!r}f"})
     kernel((count,), (1,), count, packed, size, offset, device.upload(lists.offset, np.int32),
            device.upload(lists.own, np.int32), device.upload(lists.faces, np.int32), faces, vertices,
-           device.empty(nodes, np.float32), device.empty(nodes, np.float32), heights, source)
+           device.upload(cut, np.uint8), device.empty(nodes, np.float32), device.empty(nodes, np.float32), heights,
+           source)
     colors, kind = _colors_of(mesh), 0
     if colors is not None:
         kind, texels, width, height = colors
@@ -155,6 +160,11 @@ def _colors_of(mesh: Mesh):
     if of_faces is not None and np.shape(of_faces) in ((len(mesh.faces), 3), (len(mesh.faces), 4)):
         return FACE_COLORS, rgba_of(of_faces), 0, 0
     return None if mesh.colors is None else (VERTEX_COLORS, mesh.colors, 0, 0)
+
+
+def has_colors(mesh: Mesh) -> bool:
+    """Return whether patches of the mesh have colours."""
+    return _colors_of(mesh) is not None
 
 
 def rgba_of(colors) -> NDArray:

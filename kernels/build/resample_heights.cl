@@ -4,7 +4,8 @@
 // four cells around it, or comes within REACH - 1 steps of them. Its height is that of the own face above it, the highest
 // of several; beyond the own faces that of the face around which lies closest to the plane of the nearest own face, if it
 // is within GAP_LIMIT steps of it. Where there is none (at open borders and folds) the plane is carried on, but only to
-// nodes within CARRY steps of an own face. Scratch: two floats a node.
+// nodes within CARRY steps of an own face, and never over an edge between two vertices that `cut` marks: patches of
+// its own follow that. Scratch: two floats a node.
 //
 // Paper on spatial patches, section 4.1 ("can be converted to patches, since ... projected onto a plane").
 #include "build/patch_frame.clh"
@@ -27,6 +28,8 @@
 #define UNNEEDED -2.0f
 #define OWN -1.0f         // an own face lies over it
 #define CARRIED 1e30f     // none found, near enough to carry the plane on
+#define CUT -2            // source of a node beyond an edge with patches of its own: CUT - face
+#define CUT_WIDTH 0.01f   // steps that a node may lie beyond such an edge by rounding
 #define LOOSE 2e30f       // none found
 
 typedef struct { int i0, i1, j0, j1; } NodeBox;
@@ -53,6 +56,13 @@ inline bool meets(const FlatTriangle *t, float side, float reach, float x, float
   return true;
 }
 
+// Whether the point of the weights lies on an edge with patches of its own, and the node beyond it, not on it.
+inline bool beyond_cut(const float *weight, float d2, __global const int *corners, __global const uchar *cut) {
+  bool all = d2 > CUT_WIDTH * CUT_WIDTH;
+  for (int k = 0; k < 3; k++) all = all && (weight[k] == 0.0f || cut[corners[k]] != 0);
+  return all;
+}
+
 // Height at (x, y) of the triangle's plane, carried on from its nearest point with a limited slope.
 inline float carried_height(const FlatTriangle *t, float area, float x, float y, const float *weight) {
   float nx = weight[0] * t->x[0] + weight[1] * t->x[1] + weight[2] * t->x[2];
@@ -70,8 +80,8 @@ inline float carried_height(const FlatTriangle *t, float area, float x, float y,
 __kernel void resample_heights(int patches, __global const float *frames, __global const int *size,
                                __global const int *node_offset, __global const int *list_offset,
                                __global const int *own_count, __global const int *list, __global const int *faces,
-                               __global const float *vertices, __global float *distance, __global float *gap,
-                               __global float *heights, __global int *source) {
+                               __global const float *vertices, __global const uchar *cut, __global float *distance,
+                               __global float *gap, __global float *heights, __global int *source) {
   int p = get_global_id(0);
   if (p >= patches) return;
   __global const float *frame = frames + FRAME_FLOATS * (size_t)p;
@@ -101,7 +111,7 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
           if (d2 > distance[k] || (d2 == distance[k] && z <= heights[k])) continue;
           distance[k] = d2;
           heights[k] = z;
-          source[k] = list[at];
+          source[k] = beyond_cut(weight, d2, faces + 3 * (size_t)list[at], cut) ? CUT - list[at] : list[at];
         } else if (d2 == 0.0f) {
           // heights[k] goes on holding the own plane, distance[k] takes the height found
           float z = weight[0] * t.z[0] + weight[1] * t.z[1] + weight[2] * t.z[2], miss = fabs(z - heights[k]);
@@ -113,6 +123,7 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
       }
   }
   for (int k = first; k < first + m * n; k++) {
+    if (source[k] <= CUT) gap[k] = LOOSE;
     heights[k] = gap[k] == LOOSE ? NAN : frame[FRAME_STEP] * (gap[k] >= 0.0f && gap[k] < CARRIED ? distance[k] : heights[k]);
     if (gap[k] == LOOSE) source[k] = -1;
   }
