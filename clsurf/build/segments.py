@@ -25,6 +25,7 @@ CREASE = 60.0  # degrees: mean angle over a common border that no area crosses
 CREASE_COST = 20.0  # times as far across a crease while areas grow
 TURN_COST = 4.0  # growing across an edge: its length times 1 + TURN_COST (1 - cosine) / 2
 LEAST_BEND = 1e-3  # of the mesh's mean, given to every area by its size: planes are cut into compact areas
+FLAT = 1e-6  # squared angle below which a mesh counts as flat: a disc's areas would be merged in no order otherwise
 # Times as many preliminary areas as in the end: the bunny's vertices are at most 0.057 % off its patches, 0.077 % where
 # areas are merged first and grown last, RMS the same within 5 %.
 PRELIMINARY = 2.0
@@ -136,7 +137,8 @@ class Merging:
         a, b = owner[graph.pairs].T
         inner = a == b
         self.bend = np.bincount(a[inner], graph.bend[inner], count).astype(np.float64)  # of no pair: int64
-        self.least_bend = LEAST_BEND * graph.bend.sum() / max(graph.area.sum(), 1e-300)
+        bend = max(graph.bend.sum(), FLAT * graph.length.sum())
+        self.least_bend = LEAST_BEND * bend / max(graph.area.sum(), 1e-300)
         along = (DIRECTIONS[:directions] @ graph.vertices.T).astype(np.float32)
         along = np.concatenate([along, -along])
         order = ordered(owner)
