@@ -5,6 +5,7 @@ nodes' heights are fitted to the points of the region's own sheet; a node shows 
 paper on spatial patches, section 4.5, takes few global range images instead, which leave much uncovered: patch_views.)
 """
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,13 +13,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..device import Device
-from ..errors import Cancelled, InputError
+from ..errors import InputError
 from ..surface.patch import PatchSurface
 from .patch_error import patch_distances
 from .patch_points import SheetPoints, encoded, sheet_points
-from .patch_regions import WIDEN, Regions, Sheet, find_regions, missed_regions
+from .patch_regions import WIDEN, Regions, Sheet, beside, find_regions, missed_regions
 from .quantize import quantized
 
+log = logging.getLogger("clsurf")
+
+TRIALS = 8  # spacings tried for a number of patches or an error
 SPACING = 1.25  # default distance between nodes, over the points'; below 1.2 holes appear between points
 REACH = 2.2  # of the points that a height is fitted to, over the node spacing (or 1.2 point spacings)
 SUPPORT = 1.5  # distance from a node, or from the middle of a cell, to its nearest point, over the region's spacing
@@ -27,7 +31,7 @@ NOISY = 7.0  # the same over the noise: 15 raw range images that do not quite me
 TOLERANCE = 1.0  # heights over the reference that count as the same sheet, over the node spacing (or as above)
 SLACK = 1.0  # the same, added at the full reach
 THICK = 4.0  # the same, over the noise
-MISSED = 1.5  # distance of points from their patch, over the node spacing, from which they get one of their own
+MISSED = 1.6  # distance of points from their patch, over the node spacing, from which they get one of their own
 BOUND_SHARE = 0.999  # of the points lie within `bound` of the surface
 BOUND_SAMPLES = 1 << 16
 FRAME = 18  # floats a patch (fit_patch_nodes.cl)
@@ -58,26 +62,73 @@ class Patches:
     light: NDArray | None
 
 
-def convert(scan, request, device: Device, progress) -> PatchSurface:
+def convert(scan, request, device: Device, step) -> PatchSurface:
     """Return the patches of a cloud (or of a mesh's vertices); see `clsurf.build.patches.build_patches`."""
-    step(progress, 0.0, "normals")
+    step(0.0, "points")
     points = sheet_points(scan, device)
-    step(progress, 0.4, "regions")
+    step(0.3, "regions")
     sheet = Sheet(points)
-    spacing = SPACING * points.spacing if request.spacing is None else float(request.spacing)
-    surface = patches_at(sheet, spacing, request, lambda share, what: step(progress, 0.4 + 0.6 * share, what))
-    step(progress, 1.0, "done")
+    if request.patches is not None:
+        surface = with_count(sheet, request, step)
+    elif request.error is not None:
+        surface = with_error(sheet, request, step)
+    else:
+        spacing = SPACING * points.spacing if request.spacing is None else float(request.spacing)
+        surface, _ = patches_at(sheet, spacing, request, lambda share, what: step(0.3 + 0.7 * share, what))
+    step(1.0, "done")
     return surface
 
 
-def step(progress, fraction: float, what: str) -> None:
-    """Report progress; raises Cancelled where the callback returns False."""
-    if progress(fraction, what) is False:
-        raise Cancelled("build_patches: stopped by the progress callback")
+def with_count(sheet: Sheet, request, step) -> PatchSurface:
+    """Return a surface of at most `request.patches` patches, close to as many, or the one of the fewest found."""
+    wanted = request.patches
+    area = float((sheet.local**2).sum()) * sheet.points.diagonal**2
+    m, n = request.nodes
+    spacing = np.sqrt(area / (0.4 * wanted * (m - 1) * (n - 1)))
+    best, low, high = None, 0.0, np.inf  # spacings known to give too many, and few enough
+    for trial in range(TRIALS):
+        surface, _ = patches_at(sheet, spacing, request, _part(step, trial))
+        count = len(surface)
+        better = best is None or (count <= wanted) > (len(best) <= wanted)
+        if better or (count <= wanted and count > len(best)) or (count < len(best) and len(best) > wanted):
+            best = surface
+        if 0.96 * wanted <= count <= wanted:
+            break
+        low, high = (max(low, spacing), high) if count > wanted else (low, min(high, spacing))
+        guess = spacing * np.sqrt(count / (0.98 * wanted))
+        inside = low * 1.002 < guess < high * 0.998
+        spacing = guess if inside else np.sqrt(low * high) if 0 < low and high < np.inf else guess
+    return best
 
 
-def patches_at(sheet: Sheet, spacing: float, request, progress) -> PatchSurface:
-    """Return the patches whose nodes stand `spacing` (world units) apart."""
+def with_error(sheet: Sheet, request, step) -> PatchSurface:
+    """Return the coarsest surface found whose root mean square error is at most `request.error` of the diagonal."""
+    finest, coarsest = 1.2 * sheet.points.spacing, 0.25 * sheet.points.diagonal / (min(request.nodes) - 1)
+    low, high, best = np.log(finest), np.log(max(coarsest, 1.01 * finest)), None
+    spacing = np.log(min(2 * finest, max(coarsest, 1.01 * finest)))
+    for trial in range(TRIALS):
+        surface, rms = patches_at(sheet, float(np.exp(spacing)), request, _part(step, trial))
+        if rms <= request.error * sheet.points.diagonal:
+            best, low = surface, spacing
+        else:
+            high = spacing
+            best = surface if best is None and spacing == np.log(finest) else best
+        if high - low < 0.05 or (best is not None and spacing == np.log(finest)):
+            break
+        spacing = (low + high) / 2 if best is not None or trial < TRIALS - 2 else np.log(finest)
+    if rms > request.error * sheet.points.diagonal and low == np.log(finest):
+        log.warning("build_patches: error %g not reached: %.3g at the finest spacing that the points allow",
+                    request.error, rms / sheet.points.diagonal)
+    return surface if best is None else best
+
+
+def _part(step, trial):
+    """Return the progress of one of `TRIALS` trials."""
+    return lambda share, what: step(0.3 + 0.7 * (trial + share) / TRIALS, what)
+
+
+def patches_at(sheet: Sheet, spacing: float, request, progress) -> tuple[PatchSurface, float]:
+    """Return the patches whose nodes stand `spacing` apart, and their root mean square error; world units."""
     points = sheet.points
     gap = spacing / points.diagonal
     m, n = request.nodes
@@ -93,8 +144,8 @@ def patches_at(sheet: Sheet, spacing: float, request, progress) -> PatchSurface:
     return assembled(points, parts, spacing, request)
 
 
-def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request) -> PatchSurface:
-    """Return the surface in world units, without the patches that show nothing."""
+def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request) -> tuple[PatchSurface, float]:
+    """Return the surface, without the patches that show nothing, and its root mean square error; world units."""
     keep = np.concatenate([np.isfinite(part.height).any(axis=(1, 2)) for part in parts])
     if not keep.any():
         raise InputError("scan: expected points that form a surface, got only scattered ones")
@@ -110,7 +161,10 @@ def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request
     first, missed = (part.regions.label for part in parts)
     number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)
     patch = number[np.where(missed >= 0, missed + len(parts[0].regions), first)]
-    return replace(surface, bound=bound(surface, points, patch), bound_share=BOUND_SHARE)
+    distance = distances(surface, points, patch)
+    bound = float(np.quantile(distance, BOUND_SHARE, method="higher"))
+    near = distance[distance <= bound]  # strays say nothing about the fit
+    return replace(surface, bound=bound, bound_share=BOUND_SHARE), float(np.sqrt(np.mean(near**2)))
 
 
 def own_distance(sheet: Sheet, patches: Patches, gap: float) -> NDArray:
@@ -136,8 +190,8 @@ def own_distance(sheet: Sheet, patches: Patches, gap: float) -> NDArray:
     return out
 
 
-def bound(surface: PatchSurface, points: SheetPoints, patch: NDArray) -> float:
-    """Return the distance (world units) that `BOUND_SHARE` of a sample of the points keep.
+def distances(surface: PatchSurface, points: SheetPoints, patch: NDArray) -> NDArray:
+    """Return the distances (s,) of a sample of the points to the surface, world units, never too small.
 
     Parameters
     ----------
@@ -154,7 +208,7 @@ def bound(surface: PatchSurface, points: SheetPoints, patch: NDArray) -> float:
     nodes = nodes[np.isfinite(nodes[:, 0])]
     if len(far) and len(nodes):
         distance[far] = np.minimum(distance[far], cKDTree(nodes).query(place[far])[0])
-    return float(np.quantile(distance, BOUND_SHARE, method="higher"))
+    return distance
 
 
 def fitted(sheet: Sheet, regions: Regions, gap: float, size, thick: bool = True) -> Patches:
@@ -181,8 +235,8 @@ def fitted(sheet: Sheet, regions: Regions, gap: float, size, thick: bool = True)
     coarse, noise = np.maximum(gap, 1.2 * regions.spacing), regions.noise * thick
     frames[:, 14], frames[:, 15] = np.maximum(REACH * coarse, NOISY * noise), WIDEN * regions.spacing
     frames[:, 16], frames[:, 17] = np.maximum(TOLERANCE * coarse, THICK * noise), SLACK * coarse
-    region = np.full(tree.padded, -1, np.int32)
-    region[:len(points)] = regions.label
+    region = np.full((3, tree.padded), -1, np.int32)
+    region[:, :len(points)] = beside(sheet, regions.label)
     colored = points.light is not None
     lanes = device.lanes
     tiles = [-(-k // side) for k, side in zip(size, TILES[lanes], strict=True)]
@@ -197,7 +251,8 @@ def fitted(sheet: Sheet, regions: Regions, gap: float, size, thick: bool = True)
            *tree.arguments, device.upload(region), light, out)
     height, near2, cell2, known, *light = device.download(out)
     farthest = max(FARTHEST * points.nearest, SUPPORT * points.spacing) / points.diagonal
-    shows = supported(known > 0, near2, cell2, np.maximum(np.minimum(SUPPORT * regions.spacing, farthest), 0.75 * gap))
+    support = np.maximum(np.minimum(SUPPORT * regions.spacing, farthest), 0.75 * gap)
+    shows = supported(known > 0, near2, cell2, support)
     return Patches(regions, corner, axes, np.where(shows, height, np.float32("nan")),
                    np.stack(light) if colored else None)
 

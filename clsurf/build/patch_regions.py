@@ -15,7 +15,11 @@ from ..surface.slim import frame_of_normals
 from .patch_points import SheetPoints
 from .patch_seeds import FIRST, first_seeds, lloyd, renumbered
 
-CONE = 0.35  # least cosine between a region's normal and those of its points; 0.35 is 70 degrees
+# Least cosine between a region's normal and those of its points. With 0.35 the patches' steep rims stood off the
+# surface like teeth; 0.5, `ALIKE` and BEND in patch_seeds cost 15 % more patches.
+CONE = 0.5
+ALIKE = 0.85  # least cosine between the normals of two regions that one patch may hold
+SAME_SIDE = 0.35  # least cosine between the normals of neighbours on one sheet
 STEEP = 0.7  # sine of the angle of an edge with the tangent planes above which it leads to another sheet
 SMALL = 0.06  # of a patch's area: smaller regions join a neighbour where they hang together with one
 LEAST = 4  # points of a region; fewer are outliers
@@ -89,7 +93,7 @@ class Sheet:
             edge = self.position[near] - self.position
             m = self.normals[near]
             off = np.abs(np.einsum("ij,ij->i", edge, self.normals + m)) / 2
-            agree = (near >= 0) & (np.einsum("ij,ij->i", self.normals, m) > CONE)
+            agree = (near >= 0) & (np.einsum("ij,ij->i", self.normals, m) > SAME_SIDE)
             agreed += agree
             off2 += np.where(agree, off * off, 0)
             length = np.maximum(np.sqrt(np.einsum("ij,ij->i", edge, edge)), self.spacing)
@@ -133,6 +137,18 @@ def connected(sheet: Sheet, label: NDArray) -> NDArray:
                              shape=(len(label), len(label)))
     part = sparse.csgraph.connected_components(graph, directed=False)[1]
     return renumbered(np.where(label >= 0, part, -1))[1]
+
+
+def beside(sheet: Sheet, label: NDArray) -> NDArray:
+    """Return the label of each point and up to two of those within two steps of it in the graph, (3, n); -1: none."""
+    out = np.full((3, len(label)), -1)
+    out[0] = label
+    for near in (label, None):
+        near = (out[1] if near is None else near)[sheet.columns]
+        for k in (1, 2):
+            new = (near >= 0) & (out[k, sheet.rows] < 0) & (out[:k, sheet.rows] != near).all(axis=0)
+            out[k, sheet.rows[new]] = near[new]
+    return out
 
 
 def joined(sheet: Sheet, label: NDArray, smallest: float) -> NDArray:
@@ -325,7 +341,7 @@ def common_rectangles(regions: Regions, a: NDArray, b: NDArray, size) -> tuple[N
     sides = high - low
     room = np.maximum(np.array(size) - 2 * WIDEN * np.maximum(regions.spacing[a], regions.spacing[b])[:, None],
                       0.5 * size[1])
-    facing = np.einsum("ij,ij->i", regions.axes[a, 2], regions.axes[b, 2]) > 0.5
+    facing = np.einsum("ij,ij->i", regions.axes[a, 2], regions.axes[b, 2]) > ALIKE
     # Rectangles of slanted regions overlap: a little more than the room is worth a try.
     return sides.prod(axis=1), (np.sort(sides, axis=1)[:, ::-1] <= 1.1 * room).all(axis=1) & facing
 

@@ -8,7 +8,7 @@ from .orientation import cell_numbers
 ROUNDS = 6
 FIRST = 1.3  # cubes that the first seeds stand in, over the width of a patch: 1 gave a quarter more regions
 FLATNESS = 3.0  # weight of squared distances from a region's plane, over those along it
-BEND = 0.85  # cost of 1 - cosine between normals, over the squared width of a patch: 45 degrees cost half a width
+BEND = 2.0  # cost of 1 - cosine between normals, over the squared width of a patch: 30 degrees cost half a width
 
 
 def first_seeds(sheet, side: float) -> NDArray:

@@ -2,8 +2,8 @@
 //
 // One work-item fits VW nodes, a tile of TILE_W x TILE_H, its lanes; the points come one by one. Three walks over the
 // points above the tile:
-//  1. the points of the patch's own region give a reference: their tangent planes, blended, and whether the node is
-//     needed: an own point, widened by `widen`, lies in one of its four cells;
+//  1. the points of the patch's own region, and those around it on the same sheet, give a reference: their tangent
+//     planes, blended. A node is needed if an own point, widened by `widen`, lies in one of its four cells;
 //  2. all points that face the patch's way and lie within `tolerance` of the reference (which grows by `slack` of the
 //     distance) are the sheet: a line through their heights over the reference, weighted by (1 - d^2 / R^2)^4;
 //  3. the distances from the node, and from the middle of its cell, to the nearest of those points, and their colour.
@@ -36,7 +36,7 @@ typedef union { float16 v; float s[16]; } Sixteen;
 
 // Points of a block in the patch's frame, relative to the tile.
 typedef struct {
-  Sixteen u, v, w, slope_u, slope_v;
+  Sixteen u, v, w, slope_u, slope_v, facing;
   int16 usable;
 } Block;
 
@@ -54,7 +54,7 @@ inline void load_block(Block *b, __global const float *sorted, int padded, uint 
   b->u.v = dx * t->x.x + dy * t->x.y + dz * t->x.z;
   b->v.v = dx * t->y.x + dy * t->y.y + dz * t->y.z;
   b->w.v = dx * t->z.x + dy * t->z.y + dz * t->z.z;
-  float16 facing = nx * t->z.x + ny * t->z.y + nz * t->z.z;
+  float16 facing = b->facing.v = nx * t->z.x + ny * t->z.y + nz * t->z.z;
   b->usable = (facing > FACING) & (b->u.v >= t->low_u) & (b->u.v <= t->high_u) & (b->v.v >= t->low_v) &
               (b->v.v <= t->high_v);
   float16 inverse = -1.0f / SEL((float16)1.0f, facing, facing > FACING);
@@ -74,7 +74,7 @@ __kernel void fit_patch_nodes(int patches, int columns, int rows, int tiles_x, i
                               float spacing,
                               int padded, __global const float *sorted, __global const float *boxes,
                               __global const int *node_offset, int top_level,
-                              __global const int *region,    // (padded,) patch of every point, -1 for none
+                              __global const int *region,    // (3, padded) patch of every point, those beside it; -1
                               __global const float *light,   // (4, padded) premultiplied linear colours
                               __global float *out)           // (4 or 8, patches, rows, columns)
 {
@@ -102,20 +102,22 @@ __kernel void fit_patch_nodes(int patches, int columns, int rows, int tiles_x, i
 
   VI i = LANE_INDEX % TILE_W, j = LANE_INDEX / TILE_W;
   VF u = TO_VF(i) * spacing, v = TO_VF(j) * spacing;
-  float inverse2 = 1.0f / (reach * reach), need = spacing + widen;
+  float inverse2 = 1.0f / (reach * reach);
   VF total = 0.0f, h = 0.0f, su = 0.0f, sv = 0.0f;
   VI needed = 0;
   uint list[BLOCK_LIST];
   Traversal walk;
   Block b;
-  union { int16 v; int s[16]; } chosen;
+  union { int16 v; int s[16]; } chosen, own;
   int blocks;
 
   traversal_start(&walk, top_level);
   while ((blocks = column_next(&walk, boxes, node_offset, &box, list)) > 0)
     for (int k = 0; k < blocks; ++k) {
       load_block(&b, sorted, padded, list[k], &t);
-      chosen.v = b.usable & (((__global const int16 *)region)[list[k]] == patch);
+      own.v = ((__global const int16 *)region)[list[k]] == patch;
+      chosen.v = b.usable & (own.v | (((__global const int16 *)(region + padded))[list[k]] == patch) |
+                             (((__global const int16 *)(region + 2 * (size_t)padded))[list[k]] == patch));
       if (!any_of_16(chosen.v)) continue;
       for (int p = 0; p < 16; ++p) {
         if (!chosen.s[p]) continue;
@@ -128,6 +130,8 @@ __kernel void fit_patch_nodes(int patches, int columns, int rows, int tiles_x, i
         h += g * (b.w.s[p] + b.slope_u.s[p] * du + b.slope_v.s[p] * dv);
         su += g * b.slope_u.s[p];
         sv += g * b.slope_v.s[p];
+        if (!own.s[p]) continue;
+        float need = spacing + widen * (b.facing.s[p] > 0.7f ? b.facing.s[p] : 0.7f); // slopes are longer than they look
         needed |= (du <= need) & (du >= -need) & (dv <= need) & (dv >= -need);
       }
     }
