@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes
 
+from clsurf.io.images import to_srgb8
 from clsurf.render.camera import Camera
 
 EIGHT = np.ones((3, 3), bool)  # a pixel and its neighbours
@@ -13,6 +14,7 @@ DEPTH_LIMIT = 0.02  # world units: no pixel of the perfect sphere may be further
 FACING = 0.34
 SPECKLE_SPACINGS = 0.25  # node spacings that a pixel stands out of all its neighbours by
 SPECKLE_DEGREES = 20.0  # or its normal off the mean of theirs
+SPECKLE_STEPS = 8  # or one of its colours, in sRGB steps of 255, out of all of theirs
 
 
 def sphere_faults(frame, camera: Camera, size, radius: float) -> dict:
@@ -57,31 +59,41 @@ def faults(frame, spacing: float) -> dict:
     Parameters
     ----------
     frame : Frame
-        With depth and normal.
+        With colour, depth and normal.
     spacing : float
         Of the nodes, world units.
 
     Returns
     -------
     dict
-        ``pinholes``: undrawn pixels that drawn ones enclose; ``depth_speckle``, ``normal_speckle``: pixels away from
-        the silhouette whose depth differs from each of the 8 beside them by a quarter of a node spacing and more than
-        those do among each other, or whose normal differs from the mean of theirs by 20 degrees and more than each of
-        theirs does. At an edge the neighbours differ as much.
+        ``pinholes``: undrawn pixels that drawn ones enclose; ``depth_speckle``, ``color_speckle``,
+        ``normal_speckle``: pixels away from the silhouette whose depth or colour differs from each of the 8 beside them
+        by a quarter of a node spacing or 8 of 255 steps and more than those do among each other, or whose normal
+        differs from the mean of theirs by 20 degrees and more than each of theirs does. At an edge the neighbours
+        differ as much.
     """
     drawn = np.isfinite(frame.depth)
     pinholes = binary_fill_holes(drawn) & ~drawn
     inner = binary_erosion(drawn, EIGHT, iterations=2)
     depth, normal = np.where(drawn, frame.depth, 0).astype(np.float64), np.nan_to_num(frame.normal)
     ring = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
-    beside = np.stack([np.roll(depth, at, (0, 1)) for at in ring])
-    low, high = beside.min(axis=0), beside.max(axis=0)
-    stands = np.maximum(low - depth, depth - high)
+    depth_speckle = _stands_out(depth, ring, SPECKLE_SPACINGS * spacing)
+    shown = to_srgb8(frame.color)[..., :3].astype(np.float32)
+    color_speckle = np.any([_stands_out(shown[..., c], ring, SPECKLE_STEPS) for c in range(3)], axis=0)
     mean = sum(np.roll(normal, at, (0, 1)) for at in ring)
     mean /= np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-9)
     own = (normal * mean).sum(axis=-1)
     others = np.stack([(np.roll(normal, at, (0, 1)) * mean).sum(axis=-1) for at in ring]).min(axis=0)
-    depth_speckle = stands > np.maximum(SPECKLE_SPACINGS * spacing, high - low)
     normal_speckle = (own < np.cos(np.radians(SPECKLE_DEGREES))) & (own < others)
-    return {"pinholes": int(pinholes.sum()), "depth_speckle": int((depth_speckle & inner).sum()),
-            "normal_speckle": int((normal_speckle & inner).sum()), "pixels": int(drawn.sum())}
+    specks = {"depth_speckle": depth_speckle, "color_speckle": color_speckle, "normal_speckle": normal_speckle}
+    return {"pinholes": int(pinholes.sum()), "pixels": int(drawn.sum())} | {
+        name: int((found & inner).sum()) for name, found in specks.items()}
+
+
+def _stands_out(values: NDArray, ring, limit: float) -> NDArray:
+    """Return where values (h, w) differ from each of their neighbours by `limit` and more than those do."""
+    low = high = np.roll(values, ring[0], (0, 1))
+    for at in ring[1:]:
+        beside = np.roll(values, at, (0, 1))
+        low, high = np.minimum(low, beside), np.maximum(high, beside)
+    return np.maximum(low - values, values - high) > np.maximum(limit, high - low)

@@ -25,6 +25,7 @@ from .truth import vertex_normals
 PAPER = (500, 500)
 SMALL = (150, 150)
 FULL_HD = (1920, 1080)
+CHECKED = {False: FULL_HD, True: PAPER}  # size of the pictures that faults are counted in, by `quick`
 VIEWS = ((0, 20), (90, -20), (200, 50), (300, -89))  # azimuth and elevation, degrees: the last sees a pole
 MODES = {
     "quads": {}, "triangles": {"cells": "triangles"}, "bilinear": {"cells": "bilinear"}, "smooth": {"cells": "smooth"},
@@ -54,9 +55,8 @@ class Case:
 def measure(device, quick: bool = False, profile: bool = False) -> dict:
     """Return the figures of spatial patches; `device` is an opened one."""
     surfaces = made(quick)
-    sizes = (SMALL,) if quick else (FULL_HD,)
     figures = {"models": {name: sizes_of(surface) for name, surface in surfaces.items()}}
-    figures["pictures"] = pictures(surfaces, device, sizes[0], VIEWS[:1] if quick else VIEWS)
+    figures["pictures"] = pictures(surfaces, device, CHECKED[quick], VIEWS[:1] if quick else VIEWS)
     if not quick:
         figures["conversions"], converted = patch_conversions.measure(device)
         surfaces |= converted
@@ -228,8 +228,8 @@ def show(figures: dict) -> None:
     """Print the figures."""
     print("\npictures, worst view: pixels of faults; the sphere's distance from its formula, largest error along the "
           f"axis where seen at up to 70 degrees, pixels more than {patch_pictures.DEPTH_LIMIT} off there / at all")
-    print_table(("model", "pinholes", "depth specks", "normal specks", "radial", "depth", "off"),
-                [(name, f["pinholes"], f["depth_speckle"], f["normal_speckle"],
+    print_table(("model", "pinholes", "specks: depth", "colour", "normal", "radial", "depth", "off"),
+                [(name, f["pinholes"], f["depth_speckle"], f["color_speckle"], f["normal_speckle"],
                   *((f"{f['radial']:.4f}", f"{f['depth_facing']:.4f}", f"{f['off_facing']} / {f['off']}")
                     if "radial" in f else ("-", "-", "-"))) for name, f in figures["pictures"].items()])
     if "conversions" in figures:

@@ -18,11 +18,14 @@ def exact_frame(radius=128.0):
     depth, _ = patch_pictures.sphere_depth(CAMERA, SIZE, radius)
     origins, directions = CAMERA.rays(SIZE)
     place = origins + directions * (depth.ravel() / -(directions @ CAMERA.rotation[2]))[:, None]
-    return Frame({"depth": depth, "normal": (place / radius).reshape(*depth.shape, 3)}, np.zeros(3), CAMERA)
+    gray = np.full((*depth.shape, 4), 0.5, np.float32)
+    gray[..., 3] = 1
+    return Frame({"color": gray, "depth": depth, "normal": (place / radius).reshape(*depth.shape, 3)}, np.zeros(3),
+                 CAMERA)
 
 
 def painted(frame, **arrays):
-    return Frame({"depth": frame.depth, "normal": frame.normal} | arrays, np.zeros(3), CAMERA)
+    return Frame({name: getattr(frame, name) for name in ("color", "depth", "normal")} | arrays, np.zeros(3), CAMERA)
 
 
 def test_sphere_depth_is_that_of_points_of_the_sphere():
@@ -50,7 +53,7 @@ def test_sphere_faults_count_what_is_painted():
 def test_speckle_is_counted_and_edges_are_not():
     frame = exact_frame()
     clean = patch_pictures.faults(frame, 1.0)
-    assert clean["pinholes"] == clean["depth_speckle"] == clean["normal_speckle"] == 0
+    assert clean["pinholes"] == clean["depth_speckle"] == clean["normal_speckle"] == clean["color_speckle"] == 0
     assert clean["pixels"] == np.isfinite(frame.depth).sum()
     depth, normal = frame.depth.copy(), frame.normal.copy()
     y, x = np.argwhere(np.isfinite(depth)).mean(axis=0).astype(int)
@@ -58,8 +61,12 @@ def test_speckle_is_counted_and_edges_are_not():
     normal[y + 9, x] = np.roll(normal[y + 9, x], 1)
     depth[y - 20, x] = np.nan
     depth[y + 12:, :] -= 40.0  # an occluding contour
-    found = patch_pictures.faults(painted(frame, depth=depth, normal=normal), 1.0)
-    assert (found["depth_speckle"], found["normal_speckle"], found["pinholes"]) == (1, 1, 1)
+    color = frame.color.copy()
+    color[:, x - 10:, :3] = 0.4  # an edge
+    color[y - 9, x + 5, 1] = 0.5
+    color[y - 9, x - 30, :3] = 0.505  # too little to see
+    found = patch_pictures.faults(painted(frame, color=color, depth=depth, normal=normal), 1.0)
+    assert (found["depth_speckle"], found["normal_speckle"], found["color_speckle"], found["pinholes"]) == (1,) * 4
 
 
 def test_tables_hold_the_papers_arithmetic(capsys):
