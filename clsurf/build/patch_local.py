@@ -5,7 +5,6 @@ nodes' heights are fitted to the points of the region's own sheet; a node shows 
 paper on spatial patches, section 4.5, takes few global range images instead, which leave much uncovered: patch_views.)
 """
 
-import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +17,11 @@ from ..surface.patch import PatchSurface
 from .patch_error import patch_distances
 from .patch_points import SheetPoints, encoded, sheet_points
 from .patch_regions import WIDEN, Regions, Sheet, beside, find_regions, missed_regions
+from .patch_search import searched
 from .quantize import quantized
 
-log = logging.getLogger("clsurf")
-
-TRIALS = 8  # spacings tried for a number of patches or an error
-SPACING = 1.25  # default distance between nodes, over the points'; below 1.2 holes appear between points
+SPACING = 1.25  # default distance between nodes, over the points'
+FINEST = 1.2  # below it holes appear between points
 REACH = 2.2  # of the points that a height is fitted to, over the node spacing (or 1.2 point spacings)
 SUPPORT = 1.5  # distance from a node, or from the middle of a cell, to its nearest point, over the region's spacing
 FARTHEST = 2.0  # the same, over the median distance between nearest points; or SUPPORT over the cloud's spacing
@@ -68,63 +66,11 @@ def convert(scan, request, device: Device, step) -> PatchSurface:
     points = sheet_points(scan, device)
     step(0.3, "regions")
     sheet = Sheet(points)
-    if request.patches is not None:
-        surface = with_count(sheet, request, step)
-    elif request.error is not None:
-        surface = with_error(sheet, request, step)
-    else:
-        spacing = SPACING * points.spacing if request.spacing is None else float(request.spacing)
-        surface, _ = patches_at(sheet, spacing, request, lambda share, what: step(0.3 + 0.7 * share, what))
+    surface = searched(lambda spacing, progress: patches_at(sheet, spacing, request, progress), request,
+                       SPACING * points.spacing, sheet.area, FINEST * points.spacing, points.diagonal,
+                       lambda share, what: step(0.3 + 0.7 * share, what))
     step(1.0, "done")
     return surface
-
-
-def with_count(sheet: Sheet, request, step) -> PatchSurface:
-    """Return a surface of at most `request.patches` patches, close to as many, or the one of the fewest found."""
-    wanted = request.patches
-    area = float((sheet.local**2).sum()) * sheet.points.diagonal**2
-    m, n = request.nodes
-    spacing = np.sqrt(area / (0.4 * wanted * (m - 1) * (n - 1)))
-    best, low, high = None, 0.0, np.inf  # spacings known to give too many, and few enough
-    for trial in range(TRIALS):
-        surface, _ = patches_at(sheet, spacing, request, _part(step, trial))
-        count = len(surface)
-        better = best is None or (count <= wanted) > (len(best) <= wanted)
-        if better or (count <= wanted and count > len(best)) or (count < len(best) and len(best) > wanted):
-            best = surface
-        if 0.96 * wanted <= count <= wanted:
-            break
-        low, high = (max(low, spacing), high) if count > wanted else (low, min(high, spacing))
-        guess = spacing * np.sqrt(count / (0.98 * wanted))
-        inside = low * 1.002 < guess < high * 0.998
-        spacing = guess if inside else np.sqrt(low * high) if 0 < low and high < np.inf else guess
-    return best
-
-
-def with_error(sheet: Sheet, request, step) -> PatchSurface:
-    """Return the coarsest surface found whose root mean square error is at most `request.error` of the diagonal."""
-    finest, coarsest = 1.2 * sheet.points.spacing, 0.25 * sheet.points.diagonal / (min(request.nodes) - 1)
-    low, high, best = np.log(finest), np.log(max(coarsest, 1.01 * finest)), None
-    spacing = np.log(min(2 * finest, max(coarsest, 1.01 * finest)))
-    for trial in range(TRIALS):
-        surface, rms = patches_at(sheet, float(np.exp(spacing)), request, _part(step, trial))
-        if rms <= request.error * sheet.points.diagonal:
-            best, low = surface, spacing
-        else:
-            high = spacing
-            best = surface if best is None and spacing == np.log(finest) else best
-        if high - low < 0.05 or (best is not None and spacing == np.log(finest)):
-            break
-        spacing = (low + high) / 2 if best is not None or trial < TRIALS - 2 else np.log(finest)
-    if rms > request.error * sheet.points.diagonal and low == np.log(finest):
-        log.warning("build_patches: error %g not reached: %.3g at the finest spacing that the points allow",
-                    request.error, rms / sheet.points.diagonal)
-    return surface if best is None else best
-
-
-def _part(step, trial):
-    """Return the progress of one of `TRIALS` trials."""
-    return lambda share, what: step(0.3 + 0.7 * (trial + share) / TRIALS, what)
 
 
 def patches_at(sheet: Sheet, spacing: float, request, progress) -> tuple[PatchSurface, float]:
@@ -232,7 +178,7 @@ def fitted(sheet: Sheet, regions: Regions, gap: float, size, thick: bool = True)
     frames = np.zeros((len(regions), FRAME), np.float32)
     frames[:, :3], frames[:, 3:12] = corner, axes.reshape(-1, 9)
     frames[:, 12], frames[:, 13] = regions.low, regions.high
-    coarse, noise = np.maximum(gap, 1.2 * regions.spacing), regions.noise * thick
+    coarse, noise = np.maximum(gap, FINEST * regions.spacing), regions.noise * thick
     frames[:, 14], frames[:, 15] = np.maximum(REACH * coarse, NOISY * noise), WIDEN * regions.spacing
     frames[:, 16], frames[:, 17] = np.maximum(TOLERANCE * coarse, THICK * noise), SLACK * coarse
     region = np.full((3, tree.padded), -1, np.int32)
@@ -280,8 +226,15 @@ def supported(known: NDArray, near2: NDArray, cell2: NDArray, support: NDArray) 
     out = shows.copy()
     for k, c in enumerate(corners):
         out[c] &= ~(bridging & (worst == k))
-    whole = np.logical_and.reduce([out[c] for c in corners])
-    drawn = np.zeros_like(out)
+    return in_whole_cells(out)
+
+
+def in_whole_cells(shows: NDArray) -> NDArray:
+    """Return which of the nodes `shows` (p, n, m) belong to a cell of four that all show."""
+    n, m = shows.shape[1:]
+    corners = [(slice(None), slice(j, n - 1 + j), slice(i, m - 1 + i)) for j in (0, 1) for i in (0, 1)]
+    whole = np.logical_and.reduce([shows[c] for c in corners])
+    out = np.zeros_like(shows)
     for c in corners:
-        drawn[c] |= whole
-    return drawn
+        out[c] |= whole
+    return out

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..device import Device
 from ..errors import InputError
 from ..io.cleaning import first_of_duplicates
-from .neighbours import BoxTree, box_tree, nearest
+from .neighbours import BoxTree, box_tree, nearest, sampled_covariance
 from .point_tree import PointTree, build_point_tree
 from .radius import robust_box
 from .slim import usable_points
@@ -37,6 +37,8 @@ class SheetPoints:
         World units: side of the squares of an even grid as dense as the points, the median over them.
     nearest : float
         World units: median distance to the nearest other point.
+    noise : float
+        Deviation of neighbouring points across the surface over `spacing`, median.
     diagonal : float
         Of the box without outliers.
     middle : (3,) float32
@@ -53,6 +55,7 @@ class SheetPoints:
     local: NDArray
     spacing: float
     nearest: float
+    noise: float
     diagonal: float
     middle: NDArray
     origin: NDArray
@@ -95,8 +98,8 @@ def sheet_points(scan, device: Device) -> SheetPoints:
     local = distance[:, -1] / np.float32(math.sqrt((distance.shape[1] - 0.5) / math.pi))
     spacing = even_spacing(boxes, position)
     oriented = getattr(scan, "normals", None) is not None or agreement(position, normals, neighbours) >= AGREED
-    return SheetPoints(tree, position, normals, light, neighbours, local, spacing,
-                       float(np.median(distance[:, 1])), diagonal, middle, scan.origin, oriented)
+    return SheetPoints(tree, position, normals, light, neighbours, local, spacing, float(np.median(distance[:, 1])),
+                       noise_of(boxes) / spacing, diagonal, middle, scan.origin, oriented)
 
 
 def means(values: NDArray, target: NDArray, count: int) -> NDArray:
@@ -121,6 +124,12 @@ def even_spacing(boxes: BoxTree, points: NDArray) -> float:
     sample = points[:: max(1, len(points) // SAMPLES)]
     distance = nearest(boxes, k, sample)[1][:, -1]
     return float(np.median(distance)) / math.sqrt((k - 0.5) / math.pi)
+
+
+def noise_of(boxes: BoxTree) -> float:
+    """Return how far 16 neighbours spread across the surface (standard deviation), the median of a sample."""
+    spread = sampled_covariance(boxes, min(16, len(boxes)), 5000).eigenvalues
+    return math.sqrt(float(np.median(spread[:, 0])))
 
 
 def agreement(position: NDArray, normals: NDArray, neighbours: NDArray) -> float:

@@ -105,6 +105,11 @@ class Sheet:
     def __len__(self):
         return len(self.position)
 
+    @property
+    def area(self) -> float:
+        """Area of the points' surface, about, world units."""
+        return float((self.local**2).sum()) * self.points.diagonal**2
+
 
 def find_regions(sheet: Sheet, size: tuple[float, float]) -> Regions:
     """Divide the points into regions that fit into a patch.
