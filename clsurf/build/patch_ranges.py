@@ -6,7 +6,8 @@ patches that others cover are left out. (The paper on spatial patches calls this
 motive, and future work: section 6.)
 """
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,10 @@ from ..errors import InputError
 from ..surface.patch import PatchSurface
 from ..surface.ranges import RangeScan
 from .quantize import quantized
-from .range_fields import RangeField, range_field
+from .range_fields import RangeField, coarser, range_field, raw_samples, sample_spacing
 from .range_fragments import SPACING, Fragments, find_fragments, margin_of
+
+log = logging.getLogger("clsurf")
 
 PLACE = 13  # floats of patch_place.clh
 REACH = 4  # cells around its fragment that a patch of a single image looks at
@@ -27,6 +30,10 @@ TOLERANCE = 2.0
 NOISE_TOLERANCE = 3.0  # the same over the sensor's noise
 INSIDE = 0.6  # nodes by which a patch goes on around a sample that counts as covered by it
 BATCH = 2048  # patches resampled at once
+BOUND_SHARE = 0.99  # of the samples within the tolerance of a patch: the share of them that the bound is given for
+LEAST_NODES = 4  # a patch whose nodes all lie on the border of its fragment would have none on it
+TRIALS, COUNT_SLACK = 4, 0.05  # where a number of patches is asked for, and how near to it is near enough
+COARSENINGS = (8, 4, 2, 1)  # spacings tried where an error is asked for
 FULL = 100  # code of a distance that equals the tolerance (range_distances.cl)
 
 
@@ -54,38 +61,89 @@ def convert(scan: RangeScan, request, device: Device, progress) -> PatchSurface:
         raise InputError(f"scan: method 'ranges' expects a RangeScan, got a {type(scan).__name__}")
     if not scan.sample_count:
         raise InputError("scan: expected range images with samples, got only empty ones")
+    if min(request.nodes) < LEAST_NODES:
+        raise InputError(f"nodes: expected at least {LEAST_NODES} each way for range images, got {min(request.nodes)}")
+    gap = sample_spacing(scan)
+    if request.spacing is not None or (request.patches is None and request.error is None) or not gap > 0:
+        return _converted(scan, request, request.spacing or SPACING * gap, device, progress)
+    if request.patches is not None:
+        return _with_count(scan, request, SPACING * gap, device, progress)
+    return _with_error(scan, request, SPACING * gap, device, progress)
+
+
+def _with_count(scan, request, spacing: float, device, progress) -> PatchSurface:
+    """Return the surface whose number of patches comes nearest to the one asked for, of four trials."""
+    best = None
+    for trial in range(TRIALS):
+        surface = _converted(scan, request, spacing, device, lambda f, what, t=trial: progress((t + f) / TRIALS, what))
+        if best is None or abs(len(surface) - request.patches) < abs(len(best) - request.patches):
+            best = surface
+        if abs(len(surface) - request.patches) <= COUNT_SLACK * request.patches:
+            break
+        spacing *= (len(surface) / request.patches) ** 0.5
+    return best
+
+
+def _with_error(scan, request, spacing: float, device, progress) -> PatchSurface:
+    """Return the coarsest surface, of nodes 8, 4, 2 and 1 spacings apart, that keeps the error, or the finest."""
+    for trial, times in enumerate(COARSENINGS):
+        step = lambda f, what, t=trial: progress((t + f) / len(COARSENINGS), what)  # noqa: E731
+        try:
+            surface, error = _measured(scan, request, times * spacing, device, step)
+        except InputError:
+            if times == COARSENINGS[-1]:
+                raise
+            continue
+        if error <= request.error:
+            return surface
+    log.warning("error: %.3g of the diagonal was asked for, the samples allow %.3g", request.error, error)
+    return surface
+
+
+def _converted(scan, request, spacing, device, progress) -> PatchSurface:
+    return _measured(scan, request, spacing, device, progress)[0]
+
+
+def _measured(scan: RangeScan, request, spacing: float, device: Device, progress) -> tuple[PatchSurface, float]:
+    """Return the patches with nodes `spacing` apart, and their root mean square distance over the diagonal."""
     progress(0.0, "samples")
+    gap, nodes = sample_spacing(scan), request.nodes
+    times = max(1, round(spacing / (SPACING * gap))) if gap > 0 else 1
+    scan = coarser(scan, times)
+    ratio = spacing / (times * gap) if gap > 0 else SPACING
     field = range_field(scan, device, lambda done: progress(0.3 * done, "samples"))
     progress(0.3, "fragments")
-    fragments = find_fragments(field, request.nodes, SPACING, device)
+    fragments = find_fragments(field, nodes, ratio, device)
     if not len(fragments):
         raise InputError("scan: expected samples that form a surface, got only scattered ones")
-    places = places_of(field, fragments, request.nodes, SPACING)
+    places = places_of(field, fragments, nodes, ratio)
     progress(0.5, "nodes")
-    every = np.arange(len(fragments))
-    own = own_rects(field, fragments, every)
-    heights, colors = resampled(field, fragments, places, every, own, request.nodes, device)
-    keep = np.isfinite(heights).any(axis=1)
+    kept = np.arange(len(fragments))
+    own = own_rects(field, fragments, kept)
+    heights, colors = resampled(field, fragments, places, kept, own, nodes, device)
+    pairs = np.column_stack([kept, fragments.rects, kept]).astype(np.int32)
     if len(scan) > 1:
         progress(0.6, "overlaps")
-        pairs = fragment_pairs(fragments, places, request.nodes)
-        keep = needed(field, fragments, places, pairs, heights, request.nodes, keep, device)
+        pairs = fragment_pairs(fragments, places, nodes)
+        kept = np.flatnonzero(needed(field, fragments, places, pairs, heights, nodes, device))
         progress(0.8, "blending")
-        kept, image = np.flatnonzero(keep), fragments.rects[:, 0]
-        pairs = pairs[keep[pairs[:, 0]] & (pairs[:, 1] != image[pairs[:, 0]])]
+        pairs = pairs[np.isin(pairs[:, 0], kept)]
         pairs[:, 0] = np.searchsorted(kept, pairs[:, 0])
-        pairs = np.concatenate([own_rects(field, fragments, kept), pairs])
-        places, pairs = places[kept], pairs[np.argsort(pairs[:, 0], kind="stable")]
-        heights, colors = resampled(field, fragments, places, kept, pairs, request.nodes, device)
-        keep = np.isfinite(heights).any(axis=1)
-    places, heights = places[keep], heights[keep]
+        others = pairs[pairs[:, 1] != fragments.rects[kept[pairs[:, 0]], 0]]
+        around = np.concatenate([own_rects(field, fragments, kept), others])
+        places, around = places[kept], around[np.argsort(around[:, 0], kind="stable")]
+        heights, colors = resampled(field, fragments, places, kept, around, nodes, device)
+    bound = bound_of(scan, field, fragments, places, pairs, heights, nodes, device)
+    drawn = np.isfinite(heights).any(axis=1)
+    places, heights = places[drawn], heights[drawn]
     if colors is not None:
-        colors = colors[keep].reshape(-1, 4)[:, :4 if request.precise else 3]
+        colors = colors[drawn].reshape(-1, 4)[:, :4 if request.precise else 3]
     axes = places.axes[:, :2] * places.steps[..., None]
-    surface = quantized(places.corner, axes[:, 0], axes[:, 1], heights.ravel().astype(np.float64), request.nodes,
-                        colors, request.precise, origin=field.origin, diagonal=field.diagonal)
+    surface = quantized(places.corner, axes[:, 0], axes[:, 1], heights.ravel().astype(np.float64), nodes, colors,
+                        request.precise, origin=field.origin, diagonal=field.diagonal, bound_share=bound.share)
+    rounding = float(surface.axis_z_length.max(initial=0)) / 2
     progress(1.0, "done")
-    return surface
+    return replace(surface, bound=bound.distance + rounding), bound.mean_square ** 0.5 / field.diagonal
 
 
 def places_of(field: RangeField, fragments: Fragments, nodes, ratio: float) -> Places:
@@ -177,7 +235,7 @@ def resampled(field: RangeField, fragments: Fragments, places: Places, labels: N
 
 
 def needed(field: RangeField, fragments: Fragments, places: Places, pairs: NDArray, heights: NDArray, nodes,
-           keep: NDArray, device: Device) -> NDArray:
+           device: Device) -> NDArray:
     """Return which patches (p,) bool stay.
 
     One after the other, the worst seen first, a patch goes if the others cover all that it covers.
@@ -185,14 +243,10 @@ def needed(field: RangeField, fragments: Fragments, places: Places, pairs: NDArr
     A sample is covered by a patch that goes on around it, within the tolerance of it; at borders, where no patch does,
     by one that holds it at all.
     """
-    codes, counts = distances(field, fragments, places, pairs, heights, nodes, device)
+    codes, counts = distances(field, fragments, places, pairs, heights, nodes, field.samples, device)
     near = (codes & 127) <= FULL
-    ends = np.cumsum(counts)
     at = np.flatnonzero(near)
-    pair = np.repeat(np.arange(len(pairs)), np.diff(np.searchsorted(at, np.concatenate([[0], ends]))))
-    row, column = np.divmod(at - (ends - counts)[pair], pairs[pair, 5])
-    image = pairs[pair, 1]
-    sample = field.first[image] + (pairs[pair, 2] + row) * field.shapes[image, 1] + pairs[pair, 3] + column
+    pair, sample = _samples_at(field, pairs, counts, at)
     strict = codes[at] >= 128
     inside = np.zeros(len(field.cells), bool)
     inside[sample[strict]] = True
@@ -200,7 +254,7 @@ def needed(field: RangeField, fragments: Fragments, places: Places, pairs: NDArr
     sample, patch = sample[counts], pairs[pair[counts], 0]
     first = np.searchsorted(patch, np.arange(len(fragments) + 1))
     covered = np.bincount(sample, minlength=len(field.cells))
-    keep = keep & (np.diff(first) > 0)
+    keep = np.diff(first) > 0
     for p in np.argsort(fragments.weight, kind="stable"):
         own = sample[first[p]:first[p + 1]]
         if keep[p] and (covered[own] > 1).all():
@@ -209,15 +263,51 @@ def needed(field: RangeField, fragments: Fragments, places: Places, pairs: NDArr
     return keep
 
 
+def _samples_at(field: RangeField, pairs: NDArray, counts: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the pair and the sample of the codes number `at`, ascending."""
+    ends = np.cumsum(counts)
+    pair = np.repeat(np.arange(len(pairs)), np.diff(np.searchsorted(at, np.concatenate([[0], ends]))))
+    row, column = np.divmod(at - (ends - counts)[pair], pairs[pair, 5] + 1)
+    image = pairs[pair, 1]
+    return pair, field.first[image] + (pairs[pair, 2] + row) * field.shapes[image, 1] + pairs[pair, 3] + column
+
+
 def distances(field: RangeField, fragments: Fragments, places: Places, pairs: NDArray, heights: NDArray, nodes,
-              device: Device) -> tuple[NDArray, NDArray]:
+              samples, device: Device) -> tuple[NDArray, NDArray]:
     """Return the codes (k,) uint8 of range_distances.cl, pair after pair, and how many each pair has."""
     m, n = nodes
-    counts = pairs[:, 4].astype(np.int64) * pairs[:, 5]
+    counts = (pairs[:, 4].astype(np.int64) + 1) * (pairs[:, 5] + 1)
     device.check_memory(distances=int(counts.sum()))
     out = device.empty(int(counts.sum()), np.uint8)
     device.kernel("build/range_distances.cl", constants={"M": m, "N": n})(
         (len(pairs),), (1,), len(pairs), INSIDE, device.upload(places.packed()), device.upload(heights),
         device.upload(pairs), device.upload(np.cumsum(counts) - counts), device.upload(field.image_table[:, :3]),
-        field.samples, device.upload(fragments.labels), out)
+        samples, device.upload(fragments.labels), out)
     return device.download(out), counts
+
+
+@dataclass(frozen=True)
+class Bound:
+    """`share` of the samples lie within `distance` (world units); the mean square of theirs."""
+
+    distance: float
+    share: float
+    mean_square: float
+
+
+def bound_of(scan: RangeScan, field: RangeField, fragments: Fragments, places: Places, pairs: NDArray,
+             heights: NDArray, nodes, device: Device) -> Bound:
+    """Return how far every other sample of the scan, as on a chess board, lies from the patches of `pairs`."""
+    raw = raw_samples(scan, field, device)
+    codes, counts = distances(field, fragments, places, pairs, heights, nodes, raw, device)
+    at = np.flatnonzero((codes & 127) <= FULL)
+    pair, sample = _samples_at(field, pairs, counts, at)
+    nearest = np.full(len(field.cells), np.inf)
+    np.minimum.at(nearest, sample, (codes[at] & 127) / FULL * places.tolerance[pairs[pair, 0]])
+    asked = np.concatenate([(image.valid & (np.add.outer(*map(np.arange, image.shape)) % 2 == 0)).ravel()
+                            for image in scan.images])
+    found = np.sort(nearest[asked & np.isfinite(nearest)])
+    share = np.floor(1000 * BOUND_SHARE * len(found) / max(1, int(asked.sum()))) / 1000
+    rank = min(len(found), max(1, int(np.ceil(share * asked.sum())))) - 1
+    return Bound(float(found[rank]) if len(found) else float("nan"), float(share),
+                 float(np.mean(found ** 2)) if len(found) else float("inf"))

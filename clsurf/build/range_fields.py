@@ -77,7 +77,7 @@ def range_field(scan: RangeScan, device: Device, step) -> RangeField:
     for k, image in enumerate(scan.images):
         values, noise[k] = _values(image, device)
         _place_samples(image, values, origin, int(first[k]), samples, device)
-        pitch[k], signs[k] = _pitch(image, values)
+        pitch[k], signs[k] = _pitch(image)
         rows, columns = (int(n) for n in shapes[k])
         gap = 0.0 if squared[k] else float(pitch[k].prod() ** 0.5)
         device.kernel("build/range_cells.cl")(
@@ -97,6 +97,54 @@ def range_field(scan: RangeScan, device: Device, step) -> RangeField:
                       float(np.linalg.norm(bounds[1] - bounds[0])))
 
 
+def raw_samples(scan: RangeScan, field: RangeField, device: Device) -> DeviceArray:
+    """Return the samples (n, 4) as the scan has them, not smoothed, on the device."""
+    samples = device.empty(field.samples.shape, np.float32)
+    for k, image in enumerate(scan.images):
+        values = device.upload(image.depth if image.points is None else image.points)
+        _place_samples(image, values, field.origin, int(field.first[k]), samples, device)
+    return samples
+
+
+def sample_spacing(scan: RangeScan) -> float:
+    """Return the distance of neighbouring samples, world units: the median over the images."""
+    pitch = np.array([_pitch(image)[0] for image in scan.images])
+    pitch = pitch[(pitch > 0).all(axis=1)]
+    return float(np.median(np.sqrt(pitch.prod(axis=1)))) if len(pitch) else 0.0
+
+
+def coarser(scan: RangeScan, times: int) -> RangeScan:
+    """Return `scan` with one sample, the mean, in place of `times` x `times`; those beyond a depth jump do not count.
+
+    A sample needs half of its own to be there.
+    """
+    return scan if times == 1 else RangeScan([_coarser(image, times) for image in scan.images])
+
+
+def _coarser(image: RangeImage, times: int) -> RangeImage:
+    rows, columns = (-(-n // times) for n in image.shape)
+
+    def blocks(array, fill):
+        wide = np.full((rows * times, columns * times, array.shape[2]), fill, array.dtype)
+        wide[:array.shape[0], :array.shape[1]] = array
+        return wide.reshape(rows, times, columns, times, -1).swapaxes(1, 2).reshape(rows, columns, times * times, -1)
+
+    points = blocks(image.sensor_points(), np.nan)
+    z = points[..., 2]
+    ordered, count = np.sort(z, axis=2), np.isfinite(z).sum(axis=2)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[..., None] // 2, axis=2)
+    pitch = np.sqrt(_pitch(image)[0].prod()) / _scale(image)
+    kept = np.abs(z - middle) <= JUMP * times * pitch
+    share = kept / np.maximum(kept.sum(axis=2, keepdims=True), 1)
+    mean = np.einsum("hwki,hwk->hwi", np.nan_to_num(points), share)
+    mean[kept.sum(axis=2) * 2 < times * times] = np.nan
+    color = image.sample_colors()
+    if color is not None:
+        color = np.rint(np.einsum("hwki,hwk->hwi", blocks(color, 0).astype(np.float32), share)).astype(np.uint8)
+    eye = np.zeros(3) if image.eye is None and image.depth is not None else image.eye
+    return RangeImage(points=mean, color=color, pose=image.pose, eye=eye, name=image.name)
+
+
 def _scale(image: RangeImage) -> float:
     """Return world units over the sensor's."""
     return float(np.cbrt(np.linalg.det(image.pose[:3, :3])))
@@ -111,7 +159,7 @@ def _values(image: RangeImage, device: Device) -> tuple[DeviceArray, float]:
     disparity = 1 / image.depth
     noise = noise_of(disparity[::2])
     focal = float(np.sqrt(image.intrinsics[0, 0] * image.intrinsics[1, 1]))
-    rough = noise * focal * float(np.nanmedian(image.depth)) if noise > 0 else 0.0
+    rough = noise * focal * float(np.median(image.depth[image.valid])) if noise > 0 else 0.0
     if not rough > ROUGH:
         return device.upload(image.depth), noise / scale
     radius = min(LARGEST_RADIUS, max(1, round(2.6 * rough ** 0.5)))
@@ -152,10 +200,10 @@ def _place_samples(image: RangeImage, values: DeviceArray, origin, first: int, s
     kernel((count,), (64,), count, image.shape[1], values, device.upload(matrix, np.float32), first, samples)
 
 
-def _pitch(image: RangeImage, values: DeviceArray) -> tuple[NDArray, int]:
+def _pitch(image: RangeImage) -> tuple[NDArray, int]:
     """Return the median distances of neighbours along rows and columns, world units, and the image's sign."""
     if image.depth is not None:
-        middle = np.nanmedian(image.depth) if image.valid.any() else 0.0
+        middle = np.median(image.depth[image.valid]) if image.valid.any() else 0.0
         return _scale(image) * float(middle) / np.diag(image.intrinsics)[:2], -1
     points = image.points
     right, down = (np.diff(points, axis=axis) for axis in (1, 0))

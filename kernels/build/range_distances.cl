@@ -1,8 +1,8 @@
 // How far the samples of fragments lie from patches, one work-item a pair of a patch and a fragment.
 //
-// A byte for each sample of the fragment's rectangle: the distance along the patch's axis over its tolerance, in
-// hundredths; 127: farther, beside the patch, or not in question, which are those whose cell is no part of the fragment,
-// and every other one, as on a chess board. The highest bit is set where the patch goes on by `reach` nodes on all sides.
+// A byte for each corner of the cells in the fragment's rectangle: the distance along the patch's axis over its tolerance,
+// in hundredths; 127: farther, beside the patch, or not in question, which are those that are no corner of the fragment's
+// cells, and every other one, as on a chess board. The highest bit: the patch goes on by `reach` nodes on all sides.
 //
 // pairs: patch, image, first row, first column, rows, columns, label. images: first sample, columns, sign.
 #include "build/patch_place.clh"
@@ -28,10 +28,13 @@ __kernel void range_distances(int count, float reach, __global const float *plac
   Place place = place_of(places + PLACE * pair[0]);
   __global const float *h = heights + (long)pair[0] * M * N;
   __global uchar *to = out + offsets[item];
-  for (int y = 0; y < pair[4]; y++)
-    for (int x = 0; x < pair[5]; x++) {
+  for (int y = 0; y <= pair[4]; y++)
+    for (int x = 0; x <= pair[5]; x++) {
       int k = image[0] + (pair[2] + y) * image[1] + pair[3] + x, code = BESIDE;
-      if (labels[k] == pair[6] && !((pair[2] + y + pair[3] + x) & 1)) {
+      int own = y < pair[4] && ((x < pair[5] && labels[k] == pair[6]) || (x > 0 && labels[k - 1] == pair[6]));
+      int up = k - image[1];
+      own |= y > 0 && ((x < pair[5] && labels[up] == pair[6]) || (x > 0 && labels[up - 1] == pair[6]));
+      if (own && !((pair[2] + y + pair[3] + x) & 1)) {
         float4 q = samples[k] - place.origin;
         float u = dot3(q, place.x), v = dot3(q, place.y), d = dot3(q, place.z);
         if (drawn(h, u, v)) {
@@ -47,6 +50,6 @@ __kernel void range_distances(int count, float reach, __global const float *plac
           }
         }
       }
-      to[y * pair[5] + x] = code;
+      to[y * (pair[5] + 1) + x] = code;
     }
 }
