@@ -92,7 +92,7 @@ def patch_triangles(surface, parts: int = PARTS) -> NDArray:
     return np.concatenate(out)
 
 
-def quality(surface, mesh, samples: int = SAMPLES) -> dict[str, float]:
+def quality(surface, mesh, samples: int = SAMPLES, parts: int = PARTS) -> dict[str, float]:
     """Return distances between a surface and its mesh in % of the diagonal of the mesh's box.
 
     Returns
@@ -118,7 +118,7 @@ def quality(surface, mesh, samples: int = SAMPLES) -> dict[str, float]:
     r, s = np.sqrt(generator.random(samples)), generator.random(samples)
     weights = np.stack([1 - r, r * (1 - s), r * s], axis=1)
     of_mesh = np.concatenate([(weights[:, :, None] * triangles[face]).sum(axis=1), vertices])
-    to_patches = triangle_distances(of_mesh, patch_triangles(surface))
+    to_patches = triangle_distances(of_mesh, patch_triangles(surface, parts))
     percent, rms = 100 / diagonal, lambda d: float(np.sqrt(np.mean(d ** 2)))
     there, back, at_vertices = to_mesh * percent, to_patches[:samples] * percent, to_patches[samples:] * percent
     both = float(np.sqrt((rms(there) ** 2 + rms(back) ** 2) / 2))

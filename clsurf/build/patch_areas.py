@@ -57,6 +57,8 @@ def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
         raise InputError("scan: expected a mesh with faces, got none with finite corners: points need method='local'")
     if not usable.all():
         mesh = _with_faces(mesh, mesh.faces[usable], np.flatnonzero(usable))
+        finite = np.isfinite(mesh.vertices).all(axis=1)  # the others have no face any more
+        mesh = replace(mesh, vertices=np.where(finite[:, None], mesh.vertices, mesh.vertices[mesh.faces[0, 0]]))
     used = mesh.vertices[mesh.faces.ravel()]
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0).astype(np.float64)))
     if not diagonal > 0:
@@ -74,7 +76,8 @@ def converted(mesh: Mesh, request, device, progress) -> Conversion:
     spans = np.array([m, n]) - 1 - 2 * (REACH - 1)
     area = _doubled_areas(mesh).sum() / 2
     count = request.patches or max(1, round(len(mesh.vertices) * NODES_A_VERTEX / (m * n)))
-    width = request.spacing * spans.min() if request.spacing else math.sqrt(area / count)
+    extent = np.ptp(mesh.vertices[mesh.faces.ravel()], axis=0).max()  # of a needle: its area says little
+    width = request.spacing * spans.min() if request.spacing else max(math.sqrt(area / count), extent / (8 * count))
     if request.spacing:
         count = max(1, int(area / width ** 2))
     progress(0.0, "areas")
@@ -276,7 +279,7 @@ def _distances(found: Conversion, face: NDArray, points: NDArray) -> tuple[NDArr
 
 def _with_bound(found: Conversion, diagonal: float) -> PatchSurface:
     graph = found.graph
-    chosen = np.arange(len(graph.vertices))[::max(1, len(graph.vertices) // BOUND_SAMPLES)]
+    chosen = np.unique(graph.corners)[::max(1, len(graph.vertices) // BOUND_SAMPLES)]
     upper, _ = _distances(found, _face_of_vertices(graph)[chosen], graph.vertices[chosen])
     upper = upper[np.isfinite(upper)]  # the others' patches are wholly transparent, as the scan is there
     bound = float(np.quantile(upper, BOUND_SHARE, method="higher")) if len(upper) else float("nan")
@@ -303,8 +306,9 @@ def _searched(mesh, request, device, progress, diagonal) -> Conversion:
     spacing = math.sqrt(area / max(len(mesh.vertices) * NODES_A_VERTEX / (m * n), 1)) / (min(m, n) - 1)
     least = math.sqrt(area / MOST_PATCHES) / (min(m, n) - 1)
     for step in range(SEARCH_STEPS):
-        progress(step / SEARCH_STEPS, "spacing")
-        found = converted(mesh, replace(request, error=None, spacing=spacing), device, lambda *_: None)
+        done = step / SEARCH_STEPS
+        found = converted(mesh, replace(request, error=None, spacing=spacing), device,
+                          lambda *_, done=done: progress(done, "spacing"))
         rms = _rms(found)
         tried[spacing] = rms
         if rms <= goal and (best is None or spacing > best[0]):

@@ -310,7 +310,8 @@ def turned(graph: FaceGraph, owner: NDArray, count: int) -> NDArray:
 def split_faces(corners: NDArray, vertices: NDArray, longest: float) -> tuple[NDArray, list[NDArray], NDArray]:
     """Cut faces in such a way that no edge is longer than `longest`.
 
-    Long edges are halved, in all of their faces at once, until none is left.
+    The longest edge of every face is halved, in all of its faces at once, until none is too long: needles are cut
+    across, not into ever more needles.
 
     Returns
     -------
@@ -325,25 +326,30 @@ def split_faces(corners: NDArray, vertices: NDArray, longest: float) -> tuple[ND
     place, ends = vertices, []
     done = []
     while len(faces):
-        a, b = faces, faces[:, [1, 2, 0]]
-        long = np.linalg.norm(place[a] - place[b], axis=2) > longest
-        whole = ~long.any(axis=1)
+        length = np.linalg.norm(place[faces] - place[faces[:, [1, 2, 0]]], axis=2)
+        whole = length.max(axis=1) <= longest
         done.append((faces[whole], source[whole]))
-        faces, source, long = faces[~whole], source[~whole], long[~whole]
+        faces, source, length = faces[~whole], source[~whole], length[~whole]
         if not len(faces):
             break
-        a, b = faces[long], faces[:, [1, 2, 0]][long]
-        pair = np.unique(np.stack([np.minimum(a, b), np.maximum(a, b)], axis=1), axis=0)
+        key = _edge_keys(faces, len(place))
+        chosen = np.unique(key[np.arange(len(faces)), length.argmax(axis=1)])
+        pair = np.stack(np.divmod(chosen, len(place)), axis=1)
         ends.append(pair)
-        key = pair[:, 0] * np.int64(len(place)) + pair[:, 1]
-        cut = np.full(faces.shape, -1)
-        cut[long] = len(place) + np.searchsorted(key, np.minimum(a, b) * np.int64(len(place)) + np.maximum(a, b))
+        at = np.minimum(np.searchsorted(chosen, key), len(chosen) - 1)
+        cut = np.where(chosen[at] == key, len(place) + at, -1)
         place = np.concatenate([place, (place[pair[:, 0]] + place[pair[:, 1]]) / 2])
         faces, source = _cut(faces, source, cut)
     faces = np.concatenate([f for f, _ in done]) if done else np.zeros((0, 3), np.int64)
     source = np.concatenate([s for _, s in done]) if done else np.zeros(0, np.int64)
     order = np.argsort(source, kind="stable")
     return faces[order], ends, source[order]
+
+
+def _edge_keys(faces, count) -> NDArray:
+    """Return a number (f, 3) of every edge of faces, k to k + 1, the same from both sides."""
+    a, b = faces, faces[:, [1, 2, 0]]
+    return np.minimum(a, b) * np.int64(count) + np.maximum(a, b)
 
 
 def _cut(faces, source, cut):
