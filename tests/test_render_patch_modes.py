@@ -1,14 +1,26 @@
 """The further modes of the patch renderer: table of normals, mip levels, subdivision, light at the nodes, alpha."""
 
+import itertools
+
 import numpy as np
 import pytest
 from reference import render_patch_modes as twin
+from reference.surfaces import sphere
+from scipy import ndimage
 from test_surface_patch import bowls
 
 from clsurf.build.quantize import quantized
+from clsurf.errors import InputError
+from clsurf.render.camera import Camera
 from clsurf.render.normal_table import half_steps, normal_statistics, ratio_groups
+from clsurf.render.patch_drawing import PatchDrawing
 from clsurf.render.patch_mips import halved, mip_levels, tent
-from clsurf.render.shade import to_linear
+from clsurf.render.patch_nodes import LIT_RANGE, light_nodes, table_normals
+from clsurf.render.patches import patch_constants, place_patches, project_patches, upload_patches
+from clsurf.render.renderer import Renderer
+from clsurf.render.scene import Scene
+from clsurf.render.shade import Light, Shading, shading_floats, to_linear
+from clsurf.render.tiles import Scratch
 from clsurf.surface.patch import PatchSurface
 
 # Patches to draw ------------------------------------------------------------------------------------------------------
@@ -139,3 +151,253 @@ def test_levels_of_all_kinds():
             assert (level.bounds[0] >= low - reach).all() and (level.bounds[1] <= high + reach).all()
     mixed = joined(rough(2), rough(1, (4, 11)))
     assert np.array_equal(halved(mixed).displacements[:2 * 5 * 4], halved(rough(2)).displacements)
+
+
+# Drawing --------------------------------------------------------------------------------------------------------------
+
+SIZE = (61, 47)
+FRONT = Camera.orthographic((0, 0, 5), (0, 0, 0), height=2.2)
+
+
+def sheet(height, nodes=(9, 9), spacing=0.25, precise=True, colors=None, center=(0.0, 0.0)):
+    """One patch over the xy plane, facing +z, of heights `height(x, y)`, and its nodes' x and y."""
+    m, n = nodes
+    x = (np.tile(np.arange(m), n) - (m - 1) / 2) * spacing + center[0]
+    y = (np.repeat(np.arange(n), m) - (n - 1) / 2) * spacing + center[1]
+    origin = np.array([[x[0], y[0], 0]])
+    return quantized(origin, np.array([[spacing, 0, 0]]), np.array([[0, spacing, 0]]), height(x, y), nodes, colors,
+                     precise), x, y
+
+
+def wavy(x, y):
+    return 0.12 * np.sin(5 * x) * np.cos(4 * y) + 0.1 * x
+
+
+def steps(surface, places):
+    """Places (q, 2) in nodes to the surface's own x and y."""
+    return surface.origins[0, :2] + places * [surface.axis_x[0, 0], surface.axis_y[0, 1]]
+
+
+@pytest.fixture(scope="module")
+def renderers(device):
+    with Renderer(device, lanes=16) as lanes, Renderer(device, lanes=1) as items, Renderer(device, tile=8) as small:
+        yield lanes, items, small
+
+
+CAMERAS = {"orthographic": Camera.orthographic((2, 3, 7), (0, 0, 0), height=2.6),
+           "perspective": Camera.look_at((1.6, 3.0, 4.8), (0, 0, 0), fov=24)}
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("cells", ["bilinear", "smooth"])
+def test_tile_lattice(renderers, cells, camera):
+    """Depth and normal of every pixel inside a patch are those of the twin's surface along the pixel's ray."""
+    surface, _, _ = sheet(wavy, (12, 9), 0.2)
+    channels = ("depth", "normal", "position")
+    frame = renderers[0].render(surface, camera, SIZE, channels, patches=PatchDrawing(cells=cells))
+    d, opaque = (a.reshape(9, 12) for a in (surface.displacements, surface.opaque))
+    origins, directions = camera.rays(SIZE)
+    hit = np.isfinite(frame.depth).ravel()
+    start = (frame.position.reshape(-1, 3)[hit][:, :2] - surface.origins[0, :2]) / 0.2
+    inside = ((start > 0.3) & (start < [10.7, 7.7])).all(axis=1)
+    height = (lambda x, y: twin.smooth_height(d, opaque, x, y)) if cells == "smooth" else \
+        (lambda x, y: twin.bilinear_height(d, x, y))
+    places, far = twin.seen_places(surface, 0, height, origins[hit][inside], directions[hit][inside], start[inside])
+    depth = -far * (directions[hit][inside] @ camera.rotation[2])
+    error = np.abs(depth - frame.depth.ravel()[hit][inside])
+    # Where the pixel's centre lies beside the cell whose point won, the cell is carried on by up to half a cell.
+    assert inside.sum() > 700 and np.median(error) < 2e-5 and np.quantile(error, 0.95) < 2e-3 and error.max() < 0.03
+    if cells == "smooth":
+        g = np.array([twin.smooth_height(d, opaque, *p)[1:] for p in places])
+        g *= (surface.axis_z_length / 0.2)[:, None]
+        normal = np.concatenate([-g, np.ones((len(g), 1))], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        got = frame.normal.reshape(-1, 3)[hit][inside]
+        assert np.quantile(np.abs(got - normal).max(axis=1), 0.9) < 3e-3
+
+
+@pytest.mark.parametrize("cells", ["bilinear", "smooth"])
+@pytest.mark.parametrize("distance", [1.1, 2.5, 9.0, 40.0])
+def test_subdivision_leaves_no_holes(renderers, cells, distance):
+    """Every pixel that quads cover is covered, from a cell of half the picture to cells of a tenth of a pixel."""
+    surface, _, _ = sheet(wavy, (17, 17), 0.125, precise=False)
+    for direction in ((0.2, 0.3, 1), (1, 0.4, 0.5), (-0.7, 1, 0.2)):
+        eye = distance * np.array(direction) / np.linalg.norm(direction)
+        camera = Camera.look_at(eye, (0, 0, 0), fov=40)
+        quads = renderers[0].render(surface, camera, (97, 83), ("depth",), patches=PatchDrawing(direct=False))
+        points = renderers[0].render(surface, camera, (97, 83), ("depth",), patches=PatchDrawing(cells=cells))
+        missing = np.isfinite(quads.depth) & ~np.isfinite(points.depth)
+        # A smooth outline is another one, by the difference of the surfaces; inside nothing may be missing.
+        inner = ndimage.binary_erosion(np.isfinite(quads.depth), iterations=1 if cells == "bilinear" else 3)
+        assert not (missing & inner).any() and missing.sum() <= (0 if cells == "bilinear" else 40)
+        grown = ndimage.binary_dilation(np.isfinite(quads.depth), np.ones((3, 3)), 2 if cells == "bilinear" else 4)
+        assert not (np.isfinite(points.depth) & ~grown).any()
+
+
+def test_subdivision_through_the_near_plane(renderers):
+    """A floor that passes under the eye is drawn up to the picture's lower edge."""
+    surface, _, _ = sheet(lambda x, y: 0 * x, (17, 17), 1.0)
+    camera = Camera.look_at((0, 0, 0.5), (3, 0, 0.2), up=(0, 0, 1), fov=60)
+    quads = renderers[0].render(surface, camera, (48, 40), ("depth",))
+    for cells in ("bilinear", "smooth"):
+        for r in renderers[:2]:
+            frame = r.render(surface, camera, (48, 40), ("depth",), patches=PatchDrawing(cells=cells))
+            assert not (np.isfinite(quads.depth) & ~np.isfinite(frame.depth)).any()
+            both = np.isfinite(quads.depth) & np.isfinite(frame.depth)
+            assert both.sum() > 500 and np.abs(frame.depth / quads.depth - 1)[both].max() < 1e-3
+
+
+@pytest.mark.parametrize("cells", ["bilinear", "smooth"])
+def test_subdivision_does_not_depend_on_tiles_and_lanes(renderers, cells):
+    surface = rough(40, (9, 7), holes=0.05, colors=True)
+    camera = Camera.framing(surface)
+    frames = [r.render(surface, camera, SIZE, ("color", "depth", "normal", "id"), patches=PatchDrawing(cells=cells))
+              for r in renderers]
+    for frame in frames[1:]:
+        for name, array in frame.channels.items():
+            assert np.array_equal(array, frames[0].channels[name], equal_nan=array.dtype == np.float32)
+
+
+def test_bilinear_points_agree_with_quads(renderers):
+    surface, _, _ = sheet(wavy, (17, 17), 0.125)
+    quads = renderers[0].render(surface, CAMERAS["perspective"], (160, 120), ("depth", "normal"))
+    points = renderers[0].render(surface, CAMERAS["perspective"], (160, 120), ("depth", "normal"),
+                                 patches=PatchDrawing(cells="bilinear"))
+    both = ndimage.binary_erosion(np.isfinite(quads.depth) & np.isfinite(points.depth))
+    error = np.abs(quads.depth - points.depth)[both]
+    assert both.sum() > 5000 and np.median(error) < 1e-5 and np.quantile(error, 0.99) < 2e-3
+    assert np.quantile(np.abs(quads.normal - points.normal)[both], 0.99) < 0.01
+
+
+def test_smooth_cells_have_continuous_normals(renderers):
+    """Across cells the normal changes no faster than within them; that of facets jumps."""
+    surface, _, _ = sheet(lambda x, y: 0.3 * np.sin(4 * x), (9, 9), 0.25)
+    camera = Camera.orthographic((0, 0, 5), (0, 0, 0), height=1.4)
+    frame = renderers[0].render(surface, camera, (256, 256), ("normal", "position"),
+                                patches=PatchDrawing(cells="smooth"))
+    slope = frame.normal[..., 0] / frame.normal[..., 2]
+    change = np.abs(np.diff(slope[100]))
+    assert change.max() < 4 * np.median(change) + 0.02 and np.ptp(slope[100]) > 1
+    z = frame.position[100, :, 2]
+    assert np.abs(np.diff(z) / (1.4 / 256) + (slope[100, 1:] + slope[100, :-1]) / 2).max() < 0.02
+
+
+def test_smooth_cells_pass_through_the_nodes_and_follow_the_surface_closer(renderers):
+    """Third order where bilinear cells are of the second: eight times less error a halving, here at least 6 and 3.4."""
+    def hills(x, y):
+        return 0.2 * np.sin(3 * x + 0.5) * np.cos(2 * y)
+
+    camera = Camera.orthographic((0, 0, 5), (0, 0, 0), height=0.9)
+    error = {"bilinear": [], "smooth": []}
+    for cells, list_ in error.items():
+        for nodes in (9, 17, 33):
+            surface, _, _ = sheet(hills, (nodes, nodes), 2 / (nodes - 1))
+            frame = renderers[0].render(surface, camera, (64, 64), ("position",), patches=PatchDrawing(cells=cells))
+            x, y, z = np.moveaxis(frame.position, 2, 0)
+            list_.append(np.sqrt(np.mean((z - hills(x, y)) ** 2)))
+    assert min(a / b for a, b in itertools.pairwise(error["bilinear"])) > 3.4
+    assert min(a / b for a, b in itertools.pairwise(error["smooth"])) > 6
+    assert error["smooth"][0] < 0.3 * error["bilinear"][0]
+
+
+LIGHTS = (Light(), Light("directional", (1, 2, 0.5), (0.5, 0.4, 0.3)), Light("point", (1, 1, 2), (0.2, 0.3, 0.6)))
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("lanes", [16, 1])
+def test_light_nodes(device, camera, lanes):
+    """The lit colours of all nodes are the twin's, worked out in view space."""
+    surface = rough(4, (5, 4), holes=0, colors=True, ratios=(1, 0.3))
+    upload, scratch = upload_patches(device, surface), Scratch(device, lanes)
+    matrix = np.diag([1.5, 1.5, 1.5, 1.0])
+    matrix[:3, 3] = 0.1, 0.2, -0.3
+    shading = Shading(ambient=0.1, specular=0.4, shininess=13)
+    floats = place_patches(upload, matrix, camera, (500, 400), shading)
+    lamps = shading_floats(shading, LIGHTS, (1, 1, 1), camera)
+    view = device.upload(floats)
+    rectangles = project_patches(device, scratch, upload, view, PatchDrawing()).rectangles
+    got = device.download(light_nodes(device, scratch, upload, patch_constants(upload), view, device.upload(lamps),
+                                      rectangles))
+    got = np.stack([got[:, 1] & 0xFFFF, got[:, 1] >> 16, got[:, 2] & 0xFFFF], axis=1) * LIT_RANGE / 65535
+    seen = device.download(rectangles)[:, 0] <= device.download(rectangles)[:, 2]
+    assert seen.sum() >= 3
+    for k in np.flatnonzero(seen):
+        linear = to_linear(surface.colors[20 * k:20 * k + 20] / 255)
+        wanted = twin.light_nodes(floats, lamps, surface, k, linear)
+        assert np.abs(got[20 * k:20 * k + 20] - wanted).max() < 2e-4
+
+
+@pytest.mark.parametrize("cells", ["quads", "triangles", "bilinear", "smooth"])
+def test_gouraud_is_phong_where_light_is_linear(renderers, cells):
+    """On a plane in directional light without gloss both are one colour; on a wavy one they differ, but not by much."""
+    shading, lights = Shading(specular=0, color=(0.7, 0.5, 0.3)), (Light("directional", (1, 2, 3)),)
+    for height, most in ((lambda x, y: 0.3 * x, 4e-5), (wavy, 0.06)):
+        scene = Scene([sheet(height)[0]], lights)
+        phong, gouraud = (renderers[0].render(scene, FRONT, SIZE, ("color",), shading, patches=PatchDrawing(
+            cells=cells, shading=s)).color for s in ("pixel", "gouraud"))
+        assert np.abs(phong - gouraud).max() < most
+    assert np.abs(phong - gouraud).max() > 1e-4
+
+
+def test_gouraud_beside_other_surfaces(renderers):
+    """Other surfaces of the scene keep their light per pixel; black light stays black; unlit looks are left alone."""
+    flat, ball = sheet(lambda x, y: 0 * x - 0.8)[0], sphere(200)
+    scene = Scene([flat, ball])
+    plain, mixed = (renderers[0].render(scene, FRONT, SIZE, ("color", "id"), patches=PatchDrawing(shading=s))
+                    for s in ("pixel", "gouraud"))
+    assert (plain.id == 1).sum() > 300 and np.array_equal(plain.id, mixed.id)
+    assert np.allclose(plain.color[plain.id == 1], mixed.color[mixed.id == 1], atol=1e-6)
+    dark = renderers[0].render(Scene([flat], ()), FRONT, SIZE, ("color",), Shading(ambient=0),
+                               patches=PatchDrawing(shading="gouraud"))
+    assert (dark.color[20:26, 28:32, :3] == 0).all()
+    unlit = [renderers[0].render(flat, FRONT, SIZE, ("color",), "flat", patches=PatchDrawing(shading=s)).color
+             for s in ("pixel", "gouraud")]
+    assert np.array_equal(*unlit)
+
+
+# The table on a device ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [True, "ordered", "precomputed"])
+@pytest.mark.parametrize("colors", [False, True])
+def test_table_normals(device, mode, colors):
+    """The table gives the normals that it saves computing, and computes as many as the statistics say."""
+    ratios = (1.0,) if mode == "precomputed" else (1.0, 0.5, 0.25)
+    surface = rough(9, ratios=ratios, colors=colors)
+    upload, scratch = upload_patches(device, surface), Scratch(device, 16)
+    view = device.upload(place_patches(upload, None, Camera.framing(surface, margin=1.3), (200, 200), Shading()))
+    rectangles = project_patches(device, scratch, upload, view, PatchDrawing()).rectangles
+    seen = device.download(rectangles)[:, 0] <= device.download(rectangles)[:, 2]
+    got, counts = table_normals(device, scratch, upload, patch_constants(upload), rectangles, mode, parts=1)
+    statistics = normal_statistics(surface, seen)
+    name = {True: "buffered"}.get(mode, mode)
+    assert device.download(counts).tolist() == [[statistics.normals, getattr(statistics, name)]]
+    packed = device.download(got)[:, 3].astype(np.int64)
+    got = np.stack([(packed << 16).astype(np.int32) >> 16, packed.astype(np.int32) >> 16], axis=1) / 2
+    for k in np.flatnonzero(seen):
+        (m, n), (a, b) = surface.size[k], surface.node_offset[k:k + 2]
+        opaque = surface.opaque[a:b].reshape(n, m)
+        rx, ry = (surface.axis_z_length[k] / np.linalg.norm(axis[k]) for axis in (surface.axis_x, surface.axis_y))
+        wanted = twin.table_normals(surface.displacements[a:b].reshape(n, m), opaque, rx, ry)[opaque]
+        normal = np.concatenate([-got[a:b] * [rx, ry], np.ones((b - a, 1))], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        assert np.abs(normal[opaque.ravel()] - wanted).max() < 3e-4  # 16 bits, and groups of ratios within 0.034 %
+
+
+def test_pictures_with_a_table_are_the_same(renderers):
+    surface = rough(30, holes=0.05, ratios=(1.0, 0.5))
+    camera = Camera.framing(surface)
+    for cells in ("quads", "bilinear"):
+        plain = renderers[0].render(surface, camera, SIZE, patches=PatchDrawing(cells=cells))
+        for mode in (True, "ordered"):
+            for r in renderers[:2]:
+                frame = r.render(surface, camera, SIZE, patches=PatchDrawing(cells=cells, normal_table=mode))
+                assert np.array_equal(frame.depth, plain.depth, equal_nan=True)
+                assert np.nanmax(np.abs(frame.normal - plain.normal)) < 2e-3
+
+
+def test_the_table_wants_what_it_can_hold(renderers):
+    with pytest.raises(InputError, match="ordered"):
+        renderers[0].render(rough(4), None, SIZE, patches=PatchDrawing(normal_table="precomputed"))
+    with pytest.raises(InputError, match="8-bit"):
+        renderers[0].render(sheet(wavy)[0], None, SIZE, patches=PatchDrawing(normal_table=True))

@@ -10,17 +10,20 @@ from ..surface.patch import PatchSurface
 from .normal_table import SIDE, TABLE_BYTES, ratio_groups, table_order
 from .tiles import Scratch
 
+LIT_RANGE = 4.0  # lit colours may exceed 1: gloss, several lamps
+LIT_UNIT = f"(-{LIT_RANGE:.1f}f / 65535.0f)"  # negative: the planes' mark of what is lit
 UNIT = 32767  # of the components in the table: kernels/render/table_normals.cl
 
 
 def light_nodes(device: Device, scratch: Scratch, upload, constants: dict, view: DeviceArray, lamps: DeviceArray,
-                rectangles: DeviceArray, slopes: DeviceArray) -> DeviceArray:
-    """Return the lit linear colours (N, 4) float32 of the nodes of all patches in the picture."""
-    lit = scratch.array("lit_nodes", (upload.heights.shape[0], 4), np.float32)
+                rectangles: DeviceArray) -> DeviceArray:
+    """Return the nodes (N, 4) uint32 of all patches in the picture with lit colours, in units of -`LIT_UNIT`."""
+    lit = scratch.array("lit_nodes", upload.nodes.shape, np.uint32)
     group = 64 if scratch.lanes == 1 else 1
-    device.kernel("render/light_nodes.cl", constants=constants | {"VW": scratch.lanes})(
+    constants = constants | {"VW": scratch.lanes, "LIT_RANGE": f"{LIT_RANGE:.1f}f"}
+    device.kernel("render/light_nodes.cl", constants=constants)(
         (upload.count * group,), (group,), view, lamps, rectangles, upload.frames, upload.sizes, upload.offsets,
-        upload.count, upload.heights, slopes, upload.colors, upload.linear, lit)
+        upload.count, upload.nodes, lit)
     return lit
 
 
@@ -62,7 +65,8 @@ def table_normals(device: Device, scratch: Scratch, upload, constants: dict, rec
 
     Returns
     -------
-    slopes : (N, 2) float32
+    nodes : (N, 4) uint32
+        With the slopes that the table gives.
     counts : (parts, 2) uint32
         Normals wanted and computed by each work-item.
 
@@ -84,11 +88,11 @@ def table_normals(device: Device, scratch: Scratch, upload, constants: dict, rec
         device.check_memory(tables=TABLE_BYTES * parts)
         tables = scratch.array("normal_tables", (parts, SIDE, SIDE, 4), np.uint16)
         device.fill(tables, 0)
-    slopes = scratch.array("table_slopes", upload.slopes.shape, np.float32)
+    nodes = scratch.array("table_nodes", upload.nodes.shape, np.uint32)
     counts = scratch.array("table_counts", (parts, 2), np.uint32)
     device.fill(counts, 0)
     device.kernel("render/table_normals.cl", constants=constants | {"PRECOMPUTED": precomputed})(
         (parts,), (1,), rectangles, upload.sizes, upload.offsets, upload.count,
         groups.ordered if mode == "ordered" else groups.order, groups.groups, groups.ratios,
-        -(-upload.count // parts), upload.heights, upload.colors, upload.slopes, tables, slopes, counts)
-    return slopes, counts
+        -(-upload.count // parts), upload.heights, upload.colors, upload.nodes, tables, nodes, counts)
+    return nodes, counts

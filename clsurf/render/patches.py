@@ -13,9 +13,9 @@ from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
 from .patch_drawing import PatchDrawing
-from .patch_lattice import CELLS, tile_lattice
-from .patch_nodes import light_nodes, table_normals
-from .patch_tiles import NODES, tile_patches
+from .patch_lattice import CELLS
+from .patch_nodes import LIT_UNIT, light_nodes, table_normals
+from .patch_tiles import NODES, PAD, tile_patches
 from .shade import Look, Shading, new_channels, shade_constants, to_linear
 from .tiles import Grid, Scratch, view_floats
 
@@ -23,7 +23,6 @@ FRAME_FLOATS, PATCH_FLOATS = 16, 24  # kernels/common/patch.clh
 LAYERS = (1 << 20) - 2  # kernels/render/patch_planes.clh
 LAYER_SPACINGS = 0.25  # samples of one surface within this many node spacings of depth are one layer
 LARGEST_RIM = 16383.0  # kernels/common/patch.clh
-PAD = 64  # nodes that lanes may read past the last one
 LARGEST_COUNT = (1 << 32) - 2  # a node's number is a payload of 32 bits
 
 
@@ -151,7 +150,7 @@ def project_patches(device: Device, scratch: Scratch, upload: PatchUpload, view:
     rectangles = scratch.array("patch_rectangles", (upload.count, 4), np.int32)
     boxes = scratch.array("patch_boxes", (upload.count, 4), np.int16)
     device.kernel("render/project_patches.cl", constants=patch_constants(upload) | {
-        "NODES": nodes, "DIRECT": drawing.direct})(
+        "NODES": nodes, "DIRECT": drawing.direct and drawing.cells not in CELLS and not drawing.alpha})(
         (upload.count,), (min(64, upload.count),), view, upload.frames, upload.sizes, upload.count, records, rectangles,
         boxes)
     return Projected(records, rectangles, boxes)
@@ -159,33 +158,10 @@ def project_patches(device: Device, scratch: Scratch, upload: PatchUpload, view:
 
 def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, matrix, camera, look: Look,
                  number: int) -> None:
-    """Run all stages of one placed surface: project, tile."""
-    if upload.count == 0:
-        return
-    view = device.upload(place_patches(upload, matrix, camera, grid.size, look.shading))
-    projected = project_patches(device, scratch, upload, view, look.patches)
-    rectangles = projected.rectangles
-    if look.patches.normal_table:
-        slopes, _ = table_normals(device, scratch, upload, patch_constants(upload), rectangles,
-                                  look.patches.normal_table)
-        upload = replace(upload, slopes=slopes)
-    constants = grid.layout.constants | patch_constants(upload)
-    if not (grid.layout.color and look.shading.model_colors):
-        constants["CHANNELS"] = 0
-    lit = None
-    if grid.layout.lit:
-        lit = light_nodes(device, scratch, upload, constants, view, look.lamps, rectangles, upload.slopes)
-    if look.patches.cells in CELLS:
-        tile_lattice(device, scratch, grid, upload, constants, view, projected.records, rectangles, lit, number,
-                     look.patches)
-    else:
-        tile_patches(device, scratch, grid, upload, constants, view, projected, number, look)
-
-
-def shades_at_once(drawing: PatchDrawing) -> bool:
-    """Return whether a frame of one surface drawn like this can be shaded by its tile stage."""
-    return (drawing.cells not in CELLS and drawing.shading == "pixel" and drawing.normals == "bilinear"
-            and not drawing.normal_table and not drawing.alpha)
+    """Draw one placed surface into the planes of a grid."""
+    if upload.count:
+        floats = place_patches(upload, matrix, camera, grid.size, look.shading)
+        _stages(device, scratch, grid, upload, floats, device.upload(floats), look, look.lamps, number)
 
 
 def shade_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, matrix, camera, look: Look,
@@ -194,13 +170,29 @@ def shade_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpl
 
     `whole` is the view buffer of the frame, `lamps` the shading buffer.
     """
-    floats = np.concatenate([place_patches(upload, matrix, camera, grid.size, look.shading), whole, lamps])
-    view = device.upload(floats)
-    projected = project_patches(device, scratch, upload, view, look.patches)
-    constants = grid.layout.constants | patch_constants(upload)
+    floats = place_patches(upload, matrix, camera, grid.size, look.shading)
+    view = device.upload(np.concatenate([floats, whole, lamps]))
+    out = new_channels(device, grid.size, channels)
+    lamps = device.upload(lamps) if grid.layout.lit else None
+    _stages(device, scratch, grid, upload, floats, view, look, lamps, 0, out)
+    return out
+
+
+def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, out=None) -> None:
+    """Run the stages of one surface: project, work at the nodes where a mode asks for it, tile."""
+    drawing = look.patches
+    projected = project_patches(device, scratch, upload, view, drawing)
+    constants = patch_constants(upload)
+    if drawing.normal_table:
+        nodes, _ = table_normals(device, scratch, upload, constants, projected.rectangles, drawing.normal_table)
+        upload = replace(upload, nodes=nodes)
+    constants |= grid.layout.constants
     if not (grid.layout.color and look.shading.model_colors):
         constants["CHANNELS"] = 0
-    out = new_channels(device, grid.size, channels)
-    constants |= shade_constants(grid, look.shading.look != "flat", channels)
-    tile_patches(device, scratch, grid, upload, constants, view, projected, 0, look, out)
-    return out
+    if grid.layout.lit:
+        nodes = light_nodes(device, scratch, upload, constants, view, lamps, projected.rectangles)
+        upload = replace(upload, nodes=nodes)
+        constants |= {"CHANNELS": 3, "COLOR_UNIT": LIT_UNIT}
+    if out is not None:
+        constants |= shade_constants(grid, look.shading.look != "flat", tuple(out))
+    tile_patches(device, scratch, grid, upload, constants, view, projected, number, look, out)

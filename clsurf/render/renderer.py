@@ -13,7 +13,7 @@ from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .frame import Frame
 from .patch_drawing import PatchDrawing
-from .patches import draw_patches, shade_patches, shades_at_once, upload_patches
+from .patches import draw_patches, shade_patches, upload_patches
 from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
@@ -116,7 +116,7 @@ class Renderer:
         try:
             # The stages of a frame.
             placed, origin = scene.placed, scene_origin(scene)
-            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and shades_at_once(patches)
+            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface)
             grid = self._new_grid(placed, size, channels, shading, patches, planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)

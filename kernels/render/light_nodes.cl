@@ -1,10 +1,15 @@
-// Gouraud shading (paper, section 3): the lit colour of every node of the patches in the picture. Normals are made in
-// patch space, where that takes two products, and the lamps and the eye are brought there.
+// Gouraud shading (paper, section 3): the nodes of the patches in the picture with lit colours. Normals are made in patch
+// space, where that takes two products, and the lamps and the eye are brought there.
 //
 // VW > 1: one work-item per patch, lanes over nodes. VW = 1: a work-group of 64 work-items per patch.
 // Twin: tests/reference/render_patch_modes.py, light_nodes.
 #include "common/patch.clh"
 #include "render/shade.clh"
+
+#ifndef LIT_RANGE
+#define LIT_RANGE 4.0f  // of lit colours in 16 bits
+#endif
+#define UNIT (1.0f / 65535.0f)
 
 INLINE float along(__global const float *view, __global const float *axis, float scale, const float *v) {
   float sum = 0.0f;  // v, in view space, along a model axis
@@ -14,8 +19,7 @@ INLINE float along(__global const float *view, __global const float *axis, float
 
 __kernel void light_nodes(__global const float *view, __global const float *shading, __global const int4 *rectangles,
                           __global const float *frames, __global const int *sizes, __global const uint *offsets,
-                          int count, __global const height_t *heights, __global const float2 *slopes,
-                          __global const uchar *colors, __global const float *linear, __global float4 *lit) {
+                          int count, __global const uint4 *all_nodes, __global uint4 *lit) {
 #if VW == 1
   int k = get_group_id(0), start = get_local_id(0), stride = 64;
 #else
@@ -40,17 +44,18 @@ __kernel void light_nodes(__global const float *view, __global const float *shad
   float tilt_x = length[2] / length[0], tilt_y = length[2] / length[1];
   for (int at = start; at < nodes; at += stride) {
     VF X, Y, Z, gx, gy, base[3], reflected[3], gloss[3];
+    float step = f[SCALE_OF_SLOPES];
     for (int l = 0; l < VW; l++) {
       int node = at + l < nodes ? at + l : nodes - 1;
-      ((float *)&X)[l] = node % m; ((float *)&Y)[l] = node / m; ((float *)&Z)[l] = heights[first + node];
-      ((float *)&gx)[l] = slopes[first + node].x; ((float *)&gy)[l] = slopes[first + node].y;
-      for (int c = 0; c < 3; c++) {
+      uint4 q = all_nodes[first + node];
+      ((float *)&X)[l] = node % m; ((float *)&Y)[l] = node / m; ((float *)&Z)[l] = as_float(q.x);
+      ((float *)&gx)[l] = (as_int(q.w << 16) >> 16) * step; ((float *)&gy)[l] = (as_int(q.w) >> 16) * step;
 #if CHANNELS
-        ((float *)&base[c])[l] = linear[colors[(size_t)CHANNELS * (first + node) + c]];
+      ((float *)&base[0])[l] = (q.y & 0xffffu) * UNIT; ((float *)&base[1])[l] = (q.y >> 16) * UNIT;
+      ((float *)&base[2])[l] = (q.z & 0xffffu) * UNIT;
 #else
-        ((float *)&base[c])[l] = view[PATCH_COLOR + c];
+      for (int c = 0; c < 3; c++) ((float *)&base[c])[l] = view[PATCH_COLOR + c];
 #endif
-      }
     }
     X *= sx; Y *= sy; Z *= sz;
     VF nx = -gx * tilt_x, ny = -gy * tilt_y, nz = 1.0f / VSQRT(1.0f + nx * nx + ny * ny);
@@ -72,8 +77,15 @@ __kernel void light_nodes(__global const float *view, __global const float *shad
       add_lamp(shading, lamp, IN_PATCH(v, 0), IN_PATCH(v, 1), IN_PATCH(v, 2), X, Y, Z, nx, ny, nz, ex, ey, ez, reflected,
                gloss);
     }
-    for (int c = 0; c < 3; c++) base[c] = base[c] * reflected[c] + gloss[c];
-    for (int l = 0; l < VW && at + l < nodes; l++)
-      lit[first + at + l] = (float4)(((float *)&base[0])[l], ((float *)&base[1])[l], ((float *)&base[2])[l], 1.0f);
+    for (int c = 0; c < 3; c++) {
+      base[c] = (base[c] * reflected[c] + gloss[c]) * (65535.0f / LIT_RANGE) + 0.5f;
+      base[c] = VMAX(base[c], (VF)(0.0f)); base[c] = VMIN(base[c], (VF)(65535.0f));
+    }
+    for (int l = 0; l < VW && at + l < nodes; l++) {
+      uint4 q = all_nodes[first + at + l];
+      q.y = (uint)((float *)&base[0])[l] | (uint)((float *)&base[1])[l] << 16;
+      q.z = (q.z & 0xffff0000u) | (uint)((float *)&base[2])[l];
+      lit[first + at + l] = q;
+    }
   }
 }

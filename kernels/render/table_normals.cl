@@ -14,8 +14,8 @@
 __kernel void table_normals(__global const int4 *rectangles, __global const int *sizes, __global const uint *offsets,
                             int count, __global const int *order, __global const int *groups,
                             __global const float2 *ratios, int chunk, __global const height_t *heights,
-                            __global const uchar *colors, __global const float2 *slopes, __global ushort4 *tables,
-                            __global float2 *found, __global uint2 *counts /* normals wanted, computed */) {
+                            __global const uchar *colors, __global const uint4 *nodes, __global ushort4 *tables,
+                            __global uint4 *found, __global uint2 *counts /* normals wanted, computed */) {
   int part = get_global_id(0), begin = part * chunk, end = begin + chunk < count ? begin + chunk : count;
   if (begin >= count) return;
   __global ushort4 *table = tables + (PRECOMPUTED ? 0 : (size_t)part * SIDE * SIDE);
@@ -34,13 +34,13 @@ __kernel void table_normals(__global const int4 *rectangles, __global const int 
     float2 r = ratios[groups[k]];
     uint first = offsets[k], last = first + (uint)sizes[2 * k] * sizes[2 * k + 1];
     for (uint at = first; at < last; at++) {
-      float2 g = slopes[at];
-      found[at] = g;
+      uint4 node = nodes[at];
+      found[at] = node;
       if (!opaque(colors, heights, at)) continue;
       wanted++;
-      float hx = 2.0f * fabs(g.x), hy = 2.0f * fabs(g.y);
+      int gx = as_int(node.w << 16) >> 16, gy = as_int(node.w) >> 16, hx = abs(gx), hy = abs(gy);  // half steps
       if (hx >= SIDE || hy >= SIDE) { computed++; continue; }
-      int entry = (int)hx * SIDE + (int)hy;
+      int entry = hx * SIDE + hy;
       ushort4 n = table[entry];
       if (n.w != (ushort)run) {
         float x = 0.5f * hx * r.x, y = 0.5f * hy * r.y, unit = UNIT / sqrt(1.0f + x * x + y * y);
@@ -49,7 +49,8 @@ __kernel void table_normals(__global const int4 *rectangles, __global const int 
         computed++;
       }
       float z = n.z > 0 ? n.z : 0.5f;
-      found[at] = (float2)(copysign(n.x / (z * r.x), g.x), copysign(n.y / (z * r.y), g.y));
+      int x = (int)(2.0f * n.x / (z * r.x) + 0.5f), y = (int)(2.0f * n.y / (z * r.y) + 0.5f);
+      found[at].w = ((uint)(gx < 0 ? -x : x) & 0xffffu) | (uint)(gy < 0 ? -y : y) << 16;
     }
   }
   counts[part] = (uint2)(wanted, computed);

@@ -21,6 +21,18 @@
 #ifndef ATOMICS_64
 #define ATOMICS_64 0   // VW = 1: 64-bit minimum in local memory; 0: two rounds of 32 bits
 #endif
+#ifndef LATTICE
+#define LATTICE 0      // 1: cells are subdivided into points
+#endif
+#ifndef SMOOTH_NORMALS
+#define SMOOTH_NORMALS 0  // 1: normals are those of the C1 surface through the nodes
+#endif
+#ifndef ALPHA_TEST
+#define ALPHA_TEST 0   // 1: only what has an interpolated alpha of at least 1/2 is drawn
+#endif
+#ifndef COLOR_UNIT
+#define COLOR_UNIT (1.0f / 65535.0f)  // of the nodes' colours; negative: they are lit already
+#endif
 #define TILE (TILE_BINS * BIN)
 #define BLOCKS (TILE / 4)
 
@@ -28,6 +40,7 @@
 #define GROUP 64
 #define SYNC barrier(CLK_LOCAL_MEM_FENCE)
 #define SLOTS __local uint *
+#define COSTS __local int *
 #if ATOMICS_64
 #pragma OPENCL EXTENSION cl_khr_int64_extended_atomics : enable
 #define ROUNDS 1
@@ -38,13 +51,14 @@
 #define GROUP 1
 #define SYNC
 #define SLOTS ulong *
+#define COSTS int *
 #define ROUNDS 1
 #endif
 
 typedef struct {
   __global const float *view;
   SLOTS slots;      // in blocks of 4x4 pixels, row by row
-  int *cost;        // samples of each bin
+  COSTS cost;       // samples of each bin
   int x, y;         // first pixel
   int4 limits;      // first and last pixel of the patch within the tile
   int round;
@@ -54,7 +68,8 @@ typedef struct {
 typedef struct {
   __global const float *steps;   // displacements
   __global const ushort *rims;   // distance to the border, and what is drawn
-  __global const uint4 *nodes;   // displacement, linear colour and slopes in 16 bits each
+  __global const uint4 *nodes;   // displacement, linear colour, alpha and slopes in 16 bits each
+  __global const float *twists;  // mixed differences, for what is smooth
 } Nodes;
 
 #define SLOT_OF(x, y) (((((y) >> 2) * BLOCKS + ((x) >> 2)) << 4) + (((y) & 3) << 2) + ((x) & 3))
@@ -133,6 +148,27 @@ INLINE void draw_cells(const Target *to, Spot a, Spot b, Spot c, Spot d, VI draw
   }
 }
 
+#if VW == 16
+#define GATHERED(out, base, index) { const uint *g = (const uint *)&(index); uint16 q0, q1, q2, q3; \
+    q0 = (uint16)((base)[g[0]], (base)[g[1]], (base)[g[2]], (base)[g[3]]); \
+    q1 = (uint16)((base)[g[4]], (base)[g[5]], (base)[g[6]], (base)[g[7]]); \
+    q2 = (uint16)((base)[g[8]], (base)[g[9]], (base)[g[10]], (base)[g[11]]); \
+    q3 = (uint16)((base)[g[12]], (base)[g[13]], (base)[g[14]], (base)[g[15]]); \
+    out[0] = (uint16)(q0.s048c, q1.s048c, q2.s048c, q3.s048c); out[1] = (uint16)(q0.s159d, q1.s159d, q2.s159d, q3.s159d); \
+    out[2] = (uint16)(q0.s26ae, q1.s26ae, q2.s26ae, q3.s26ae); out[3] = (uint16)(q0.s37bf, q1.s37bf, q2.s37bf, q3.s37bf); }
+#elif VW == 1
+#define GATHERED(out, base, index) { uint4 q = (base)[index]; out[0] = q.x; out[1] = q.y; out[2] = q.z; out[3] = q.w; }
+#else
+#define GATHERED(out, base, index) for (int l = 0; l < VW; l++) { uint4 q = (base)[((const uint *)&(index))[l]]; \
+    ((uint *)&out[0])[l] = q.x; ((uint *)&out[1])[l] = q.y; ((uint *)&out[2])[l] = q.z; ((uint *)&out[3])[l] = q.w; }
+#endif
+#define RED(n) TO_VF(AS_VI(n[1] & 0xffffu))
+#define GREEN(n) TO_VF(AS_VI(n[1] >> 16))
+#define BLUE(n) TO_VF(AS_VI(n[2] & 0xffffu))
+#define ALPHA(n) TO_VF(AS_VI(n[2] >> 16))
+#define HALF_ALPHA 32767.5f
+#define SLOPE_X(n) TO_VF(AS_VI(n[3] << 16) >> 16)
+#define SLOPE_Y(n) TO_VF(AS_VI(n[3]) >> 16)
 
 #if VW > 1
 typedef VF __attribute__((aligned(4))) FloatsAt;
@@ -327,6 +363,11 @@ INLINE void draw_nodes(const Target *to, Nodes nodes, __global const float *h, i
   }
 }
 
+#include "render/patch_heights.clh"
+#if LATTICE
+#include "render/patch_lattice.clh"
+#endif
+
 INLINE uint patch_of(uint node, __global const uint *offsets, int count) {
 #if EQUAL_NODES
   return node / EQUAL_NODES;
@@ -347,21 +388,6 @@ typedef struct {
   __global const uint *offsets;
   int count;
 } Patches;
-
-#if VW == 16
-#define GATHERED(out, base, index) { const uint *g = (const uint *)&(index); uint16 q0, q1, q2, q3; \
-    q0 = (uint16)((base)[g[0]], (base)[g[1]], (base)[g[2]], (base)[g[3]]); \
-    q1 = (uint16)((base)[g[4]], (base)[g[5]], (base)[g[6]], (base)[g[7]]); \
-    q2 = (uint16)((base)[g[8]], (base)[g[9]], (base)[g[10]], (base)[g[11]]); \
-    q3 = (uint16)((base)[g[12]], (base)[g[13]], (base)[g[14]], (base)[g[15]]); \
-    out[0] = (uint16)(q0.s048c, q1.s048c, q2.s048c, q3.s048c); out[1] = (uint16)(q0.s159d, q1.s159d, q2.s159d, q3.s159d); \
-    out[2] = (uint16)(q0.s26ae, q1.s26ae, q2.s26ae, q3.s26ae); out[3] = (uint16)(q0.s37bf, q1.s37bf, q2.s37bf, q3.s37bf); }
-#elif VW == 1
-#define GATHERED(out, base, index) { uint4 q = (base)[index]; out[0] = q.x; out[1] = q.y; out[2] = q.z; out[3] = q.w; }
-#else
-#define GATHERED(out, base, index) for (int l = 0; l < VW; l++) { uint4 q = (base)[((const uint *)&(index))[l]]; \
-    ((uint *)&out[0])[l] = q.x; ((uint *)&out[1])[l] = q.y; ((uint *)&out[2])[l] = q.z; ((uint *)&out[3])[l] = q.w; }
-#endif
 
 // What the winners show at pixels (px, py); `payload` NO_SAMPLE: nothing.
 INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, VU payload, VF px, VF py) {
@@ -389,11 +415,6 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
     VF fi = TO_VF(i), fj = TO_VF(j), x, y, z, w, depth, gx, gy, red = zero, green = zero, blue = zero;
     VU a[4];
     GATHERED(a, nodes.nodes, at)
-#define RED(n) TO_VF(AS_VI(n[1] & 0xffffu))
-#define GREEN(n) TO_VF(AS_VI(n[1] >> 16))
-#define BLUE(n) TO_VF(AS_VI(n[2] & 0xffffu))
-#define SLOPE_X(n) TO_VF(AS_VI(n[3] << 16) >> 16)
-#define SLOPE_Y(n) TO_VF(AS_VI(n[3]) >> 16)
     if (flags & PATCH_DIRECT) {
       project_nodes(h, perspective, fi, fj, AS_VF(a[0]), &x, &y, &depth, &w);
       gx = SLOPE_X(a); gy = SLOPE_Y(a);
@@ -410,12 +431,34 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
       project_nodes(h, perspective, fi + 1.0f, fj, AS_VF(b[0]), &bx, &by, &bz, &bw);
       project_nodes(h, perspective, fi, fj + 1.0f, AS_VF(c[0]), &cx, &cy, &cz, &cw);
       project_nodes(h, perspective, fi + 1.0f, fj + 1.0f, AS_VF(d[0]), &dx, &dy, &dz, &dw);
+#if LATTICE || SMOOTH_NORMALS
+      Heights cell;
+#define CORNER(k, n, node) cell.d[k] = AS_VF(n[0]); cell.gx[k] = SLOPE_X(n) * h[SLOPE_SCALE]; \
+    cell.gy[k] = SLOPE_Y(n) * h[SLOPE_SCALE]; cell.gxy[k] = zero; \
+    if (SMOOTH || SMOOTH_NORMALS) \
+      for (int l = 0; l < VW; l++) ((float *)&cell.gxy[k])[l] = nodes.twists[((const uint *)&node)[l]];
+      CORNER(0, a, at) CORNER(1, b, next) CORNER(2, c, above) CORNER(3, d, across)
+#endif
+#if LATTICE
+      depth = seen_place(&cell, h, perspective, fi, fj, px, py, &s, &t);
+#else
       place_in_cell(x - px * w, y - py * w, bx - px * bw, by - py * bw, cx - px * cw, cy - py * cw, dx - px * dw,
                     dy - py * dw, z, bz, cz, dz, view[NEAR], &s, &t, &depth);
+#endif
       // Weights of the corners; the depth of two triangles is not bilinear.
       VF wd = s * t, wb = s - wd, wc = t - wd, wa = 1.0f - s - wc;
 #define MEAN(f) (wa * f(a) + wb * f(b) + wc * f(c) + wd * f(d))
+#if SMOOTH || SMOOTH_NORMALS
+      smooth_height(&cell, s, t, &gx, &gy);
+      gx *= 1.0f / h[SLOPE_SCALE]; gy *= 1.0f / h[SLOPE_SCALE];
+#else
       gx = MEAN(SLOPE_X); gy = MEAN(SLOPE_Y);
+#endif
+#if LATTICE
+      // Depth and normal are carried on beyond the cell, colours are not: they could leave their range.
+      s = limited(s, zero, (VF)(1.0f)); t = limited(t, zero, (VF)(1.0f));
+      wd = s * t; wb = s - wd; wc = t - wd; wa = 1.0f - s - wc;
+#endif
 #if FIELD_COLOR >= 0 && CHANNELS
       red = MEAN(RED); green = MEAN(GREEN); blue = MEAN(BLUE);
 #endif
@@ -423,6 +466,9 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
     float scale = h[SLOPE_SCALE];
     gx *= scale; gy *= scale;
     out.depth = SEL(out.depth, depth, mine);
+#if FIELD_LEVEL >= 0
+    out.level = SEL(out.level, (VI)(flags >> PATCH_LEVEL), mine);
+#endif
     out.nx = SEL(out.nx, h[NX] - gx * h[NX + 1] - gy * h[NX + 2], mine);
     out.ny = SEL(out.ny, h[NY] - gx * h[NY + 1] - gy * h[NY + 2], mine);
     out.nz = SEL(out.nz, h[NZ] - gx * h[NZ + 1] - gy * h[NZ + 2], mine);
@@ -432,8 +478,7 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
   }
 #if FIELD_COLOR >= 0
 #if CHANNELS
-  float unit = 1.0f / 65535.0f;
-  out.red *= unit; out.green *= unit; out.blue *= unit;
+  out.red *= COLOR_UNIT; out.green *= COLOR_UNIT; out.blue *= COLOR_UNIT;
 #else
   out.red = view[PATCH_COLOR]; out.green = view[PATCH_COLOR + 1]; out.blue = view[PATCH_COLOR + 2];
 #endif
@@ -508,6 +553,9 @@ INLINE void draw_hit(Target *to, Patches patches, Nodes nodes, int k, int4 box, 
   int flags = as_int(h[PATCH_FLAGS]);
   uint first = patches.offsets[k];
   to->limits = box;
+#if LATTICE
+  draw_lattice(to, nodes, h, perspective, first, m, n, item);
+#else
   if (flags & PATCH_DIRECT) draw_nodes(to, nodes, h, perspective, first, m, n, item);
 #if VW == 1
   else if (flags & PATCH_CLIPPED) draw_large(to, nodes, h, perspective, first, m, n, item);
@@ -515,18 +563,19 @@ INLINE void draw_hit(Target *to, Patches patches, Nodes nodes, int k, int4 box, 
   else if (flags & (PATCH_CLIPPED | PATCH_LARGE)) draw_large(to, nodes, h, perspective, first, m, n, item);
 #endif
   else draw_patch(to, nodes, h, perspective, first, m, n, flags & PATCH_LARGE, item);
+#endif
 }
 
 __kernel void tile_patches(__global const float *view, __global const short4 *boxes /* bins */,
                            __global const float *records, __global const int *sizes, __global const uint *offsets,
                            int count, __global const float *steps, __global const ushort *rims,
-                           __global const uint4 *all_nodes, int surface, int tiles_x, int tile_count, int bins_x,
+                           __global const uint4 *all_nodes, __global const float *twists, int surface, int tiles_x, int tile_count, int bins_x,
                            int bins_y, __global int *touched, __global float *all_planes,
                            __global float4 *color, __global float *depth, __global float *normal,
                            __global float *position, __global int *id, __global int *number, __global int *level,
                            __global int *cost_out) {
   Patches patches = {records, sizes, offsets, count};
-  Nodes nodes = {steps, rims, all_nodes};
+  Nodes nodes = {steps, rims, all_nodes, twists};
   Target to;
   to.view = view;
 #if VW == 1
@@ -543,7 +592,7 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
   int bin_x = tile % tiles_x * TILE_BINS, bin_y = tile / tiles_x * TILE_BINS;
   to.x = bin_x * BIN; to.y = bin_y * BIN;
   to.slots = slots;
-  to.cost = (int *)cost;
+  to.cost = cost;
   int4 whole = (int4)(to.x, to.y, (to.x + TILE < width ? to.x + TILE : width) - 1,
                       (to.y + TILE < height ? to.y + TILE : height) - 1);
 #define MISSES(b) (b.x > bin_x + TILE_BINS - 1 || b.z < bin_x || b.y > bin_y + TILE_BINS - 1 || b.w < bin_y)

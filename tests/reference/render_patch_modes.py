@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from .render import opened, shade
+
 
 def average(channels, factor):
     """The channels (by name) of a picture from those of one `factor` times as large each way."""
@@ -64,3 +66,77 @@ def table_counts(surface):
                 held.add(key)
         computed.append(count)
     return wanted, *computed
+
+
+def table_normals(d, opaque, rx, ry):
+    """Unit normals (n, m, 3) in patch space from one patch's slopes; `rx`, `ry` are |a_z| / |a_x|, |a_z| / |a_y|."""
+    g = slopes(d, opaque)
+    normal = np.stack([-g[..., 0] * rx, -g[..., 1] * ry, np.ones(d.shape)], axis=-1)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def smooth_height(d, opaque, x, y):
+    """Height and slopes at the place (x, y), in nodes, of the bicubic Hermite surface through heights (n, m)."""
+    g = slopes(d, opaque)
+    twist = slopes(g[..., 0], opaque)[..., 1]
+    n, m = d.shape
+    i, j = min(int(x), m - 2), min(int(y), n - 2)
+    s, t = x - i, y - j
+    basis = np.array([[1, 0, -3, 2], [0, 0, 3, -2], [0, 1, -2, 1], [0, 0, -1, 1]])  # value 0, 1, slope 0, 1
+    powers = lambda v: np.array([1, v, v * v, v ** 3])  # noqa: E731
+    rates = lambda v: np.array([0, 1, 2 * v, 3 * v * v])  # noqa: E731
+    at = np.ix_([j, j + 1], [i, i + 1])
+    table = np.block([[d[at].astype(float), g[..., 0][at]], [g[..., 1][at], twist[at]]])  # rows: y, columns: x
+    a, b = basis @ powers(s), basis @ powers(t)
+    return b @ table @ a, b @ table @ (basis @ rates(s)), (basis @ rates(t)) @ table @ a
+
+
+def bilinear_height(d, x, y):
+    """Height and slopes at the place (x, y), in nodes, of the bilinear cells of one patch's heights (n, m)."""
+    n, m = d.shape
+    i, j = min(int(x), m - 2), min(int(y), n - 2)
+    s, t = x - i, y - j
+    (a, b), (c, e) = d[j:j + 2, i:i + 2].astype(float)
+    twist = a - b - c + e
+    return a + s * (b - a) + t * (c - a) + s * t * twist, b - a + t * twist, c - a + s * twist
+
+
+def seen_places(surface, k, height, origins, directions, start):
+    """Where rays (model space) meet one patch: places (q, 2) in nodes and distances, by Newton from `start`."""
+    axes = np.stack([surface.axis_x[k], surface.axis_y[k], surface.axis_z[k]]).astype(np.float64)
+    inverse = np.linalg.inv(axes.T)
+    o, v = (origins - surface.origins[k]) @ inverse.T, directions @ inverse.T  # in nodes, nodes, steps
+    out, far = np.array(start, float), np.zeros(len(o))
+    m, n = surface.size[k]
+    for q in range(len(o)):
+        x, y = out[q]
+        for _ in range(20):
+            z, gx, gy = height(np.clip(x, 0, m - 1), np.clip(y, 0, n - 1))
+            # The ray stays at the place (x, y) where o + r v = (x, y, z).
+            matrix = np.array([[1, 0, -v[q, 0]], [0, 1, -v[q, 1]], [gx, gy, -v[q, 2]]])
+            dx, dy, far[q] = np.linalg.solve(matrix, [o[q, 0] - x, o[q, 1] - y, o[q, 2] - z])
+            x, y = x + dx, y + dy
+        out[q] = x, y
+    return out, far
+
+
+def light_nodes(view, shading, surface, k, linear):
+    """Lit colours (n m, 3) of one patch's nodes of the unlit colours `linear` (n m, 3), worked out in view space."""
+    v = opened(view)
+    a, b = surface.node_offset[k:k + 2]
+    m, n = surface.size[k]
+    i, j = np.tile(np.arange(m), n)[:, None], np.repeat(np.arange(n), m)[:, None]
+    d = surface.displacements[a:b].astype(float)
+    frame = np.stack([surface.axis_x[k], surface.axis_y[k], surface.axis_z[k]]).astype(np.float64)
+    p = surface.origins[k] + i * frame[0] + j * frame[1] + d[:, None] * frame[2]
+    p = v.scale * p @ v.rotation.T + v.offset
+    length = np.linalg.norm(frame, axis=1)
+    shows = surface.opaque[a:b].reshape(n, m)
+    normal = table_normals(d.reshape(n, m), shows, length[2] / length[0], length[2] / length[1])
+    normal = normal.reshape(-1, 3) @ (frame / length[:, None]) @ v.rotation.T
+    eye = -p if v.perspective else np.tile([0, 0, 1.0], (len(p), 1))
+    normal *= np.where((normal * eye).sum(axis=1) < 0, -1, 1)[:, None]
+    depth = -p[:, 2]
+    w = depth if v.perspective else 1.0
+    pixels = np.stack([v.cx + v.fx * p[:, 0] / w, v.cy - v.fy * p[:, 1] / w], axis=1)
+    return shade(view, shading, pixels, depth, normal, linear)[:, :3]
