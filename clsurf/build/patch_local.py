@@ -100,8 +100,10 @@ def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request
     axes = np.concatenate([part.axes for part in parts])[keep]
     colors = None
     if points.light is not None:
-        colors = encoded(np.concatenate([part.light for part in parts], axis=1)[:, keep].reshape(4, -1).T)
-        colors = colors if request.precise else colors[:, :3]
+        colors = np.zeros((height.size, 4 if request.precise else 3), np.uint8)
+        shows = np.isfinite(height.ravel())
+        light = np.concatenate([part.light for part in parts], axis=1)[:, keep].reshape(4, -1)
+        colors[shows] = encoded(light[:, shows].T)[:, :colors.shape[1]]
     surface = quantized(corner, axes[:, 0] * spacing, axes[:, 1] * spacing, height.ravel(), request.nodes, colors,
                         request.precise, origin=points.origin, diagonal=points.diagonal, oriented=points.oriented)
     first, missed = (part.regions.label for part in parts)

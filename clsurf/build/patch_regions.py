@@ -146,13 +146,15 @@ def connected(sheet: Sheet, label: NDArray) -> NDArray:
 
 def beside(sheet: Sheet, label: NDArray) -> NDArray:
     """Return the label of each point and up to two of those within two steps of it in the graph, (3, n); -1: none."""
-    out = np.full((3, len(label)), -1)
+    out = np.full((3, len(label)), -1, np.int32)
     out[0] = label
-    for near in (label, None):
-        near = (out[1] if near is None else near)[sheet.columns]
+    for source in (0, 1):
+        near = out[source][sheet.columns]
+        keep = np.flatnonzero((near >= 0) & (near != out[0][sheet.rows]))  # few: those at the borders
+        rows, near = sheet.rows[keep], near[keep]
         for k in (1, 2):
-            new = (near >= 0) & (out[k, sheet.rows] < 0) & (out[:k, sheet.rows] != near).all(axis=0)
-            out[k, sheet.rows[new]] = near[new]
+            new = (out[k, rows] < 0) & (out[1, rows] != near)
+            out[k, rows[new]] = near[new]
     return out
 
 

@@ -32,7 +32,7 @@ def searched(at, request, default: float, area: float, finest: float, diagonal: 
         m, n = request.nodes
         return with_count(at, request.patches, float(np.sqrt(area / (0.4 * request.patches * (m - 1) * (n - 1)))), step)
     if request.error is not None:
-        coarsest = max(0.25 * diagonal / (min(request.nodes) - 1), 1.01 * finest)
+        coarsest = max(0.5 * diagonal / (min(request.nodes) - 1), 1.01 * finest)
         return with_error(at, request.error * diagonal, finest, coarsest, step)
     return at(default if request.spacing is None else float(request.spacing), step)[0]
 

@@ -23,7 +23,6 @@ from .radius import robust_box
 VIEWS = 32  # directions; those that show nothing new are left out
 JUMP = 3.0  # difference of depth between neighbouring pixels, over their side, that is a jump
 THICKNESS = 1.5  # points this far behind the nearest one of a pixel, over its side, count as the same sheet
-FILLED = 5  # neighbours of eight that a gap must have
 FLAT = 0.35  # least cosine between a pixel's normal and the view for it to be a node
 GOOD = 0.55  # the same for points that a view is chosen for and that count as shown
 NOISY = 0.2  # noise over the spacing from which the images are smoothed
@@ -144,12 +143,11 @@ def range_image(points: SheetPoints, direction: NDArray, box: NDArray, gap: floa
     number = np.maximum(sums[0], 1)
     front = -np.where(bits & 0x80000000, bits & 0x7FFFFFFF, ~bits).astype(np.uint32).view(np.float32).astype(np.float64)
     height = np.where(sums[0] > 0, front + sums[1] / number * unit, np.nan)
-    light = np.moveaxis(sums[3:] / number / 4096, 0, -1) if colored else None
+    light = np.ascontiguousarray(np.moveaxis(sums[3:] / number / 4096, 0, -1)) if colored else None
     image = View(corner, axes, height, sums[2] / number / 4096, light)
     hidden = neighbours_over(image.height, JUMP * gap) >= 3  # seen between the points of a nearer sheet
     image.height[hidden] = np.nan
-    for _ in range(2):
-        fill_gaps(image, gap)
+    fill_gaps(image, gap)
     image.height[neighbours_over(image.height, JUMP * gap, diagonal=False) > 0] = np.nan
     if points.noise > NOISY:
         smooth(image, gap)
@@ -174,26 +172,38 @@ def neighbours_over(height: NDArray, limit: float, diagonal: bool = True) -> NDA
 
 
 def fill_gaps(image: View, gap: float) -> None:
-    """Fill the pixels of one ring of gaps, in place, with the means of their neighbours, where these have no jump."""
-    empty = ~np.isfinite(image.height)
-    around = np.stack([shifted(image.height, *step)[empty] for step in AROUND])
-    known = np.isfinite(around)
-    with np.errstate(all="ignore"):
-        spread = np.where(known, around, -np.inf).max(axis=0) - np.where(known, around, np.inf).min(axis=0)
-    fill = (known.sum(axis=0) >= FILLED) & (spread < JUMP * gap)
-    number = np.maximum(known.sum(axis=0), 1)
-    rows, columns = (a[fill] for a in np.nonzero(empty))
+    """Fill gaps of one or two pixels, in place, by interpolation between known pixels on opposite sides.
 
-    def mean(values):
-        beside = np.stack([shifted(values, *step)[empty] for step in AROUND])
-        return (np.where(known, np.nan_to_num(beside), 0).sum(axis=0) / number)[fill]
+    Two of the four directions through a pixel must have such a pair; where the pairs' depths differ by a jump, the gap
+    stays.
+    """
+    known = np.isfinite(image.height)
+    rows, columns = np.nonzero(ndimage.binary_dilation(known, np.ones((3, 3), bool)) & ~known)
+    padded = np.pad(image.height, 2, constant_values=np.nan)
+    pairs = []  # weight, first and second pixel (places in the padded image) of the nearest pair in each direction
+    for dj, di in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        at = lambda k: (rows + 2 + k * dj, columns + 2 + k * di)  # noqa: B023, E731
+        one, two, back_one, back_two = (np.isfinite(padded[at(k)]) for k in (1, 2, -1, -2))
+        ahead, behind = np.where(one, 1, 2), np.where(back_one, 1, 2)
+        whole = (one | two) & (back_one | back_two) & (ahead + behind < 4)
+        pairs.append((whole, behind / (ahead + behind), at(ahead), at(-behind)))
+    number = sum(whole.astype(int) for whole, *_ in pairs)
 
-    facing = mean(image.facing)
-    light = None if image.light is None else np.stack([mean(image.light[..., k]) for k in range(4)], axis=-1)
-    image.height[rows, columns] = np.where(known, around, 0).sum(axis=0)[fill] / number[fill]
-    image.facing[rows, columns] = facing
-    if light is not None:
-        image.light[rows, columns] = light
+    def between(values):
+        values = np.pad(values, 2, constant_values=np.nan)
+        total, low, high = np.zeros(len(rows)), np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
+        for whole, share, a, b in pairs:
+            a, b = np.where(whole, values[a], 0), np.where(whole, values[b], 0)
+            total += share * a + (1 - share) * b
+            low = np.where(whole, np.minimum(low, np.minimum(a, b)), low)
+            high = np.where(whole, np.maximum(high, np.maximum(a, b)), high)
+        return total / np.maximum(number, 1), high - low
+
+    height, spread = between(image.height)
+    fill = (number >= 2) & (spread < JUMP * gap)
+    for channel in (image.facing, *([] if image.light is None else np.moveaxis(image.light, -1, 0))):
+        channel[rows[fill], columns[fill]] = between(channel)[0][fill]
+    image.height[rows[fill], columns[fill]] = height[fill]
 
 
 def smooth(image: View, gap: float) -> None:
