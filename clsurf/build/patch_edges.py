@@ -24,7 +24,7 @@ TWIST = 20.0  # degrees that half-angle normals of one strip differ
 # Node spacings: mean length (weighted by itself) of the lines, from junction or corner to the next, that hang together.
 # Fandisk 105; noisy meshes and the ragged parts of scans 4-12: edges there would ask for many short strips.
 LEAST_LINE = 15.0
-LEAST_STRIP = 3.0  # node spacings: lines that break into shorter strips are ragged
+LEAST_STRIP = 2.0  # node spacings: lines that break into shorter strips are ragged
 STEEPEST = 0.08  # cosine between a strip's z and a face of it
 
 

@@ -14,7 +14,7 @@ from .patch_edges import ALONG, NO_STRIPS, STEEPEST, Strips, inner_columns, shar
 from .resample import FaceLists, Frames
 from .segments import FaceGraph
 
-LARGEST_SHARE = 0.5  # of a requested number of patches
+LARGEST_SHARE = 0.6  # of a requested number of patches
 LEAST_NODES = 5  # a patch of fewer each way is no finer across an edge than the patches beside it
 HALF_WIDTH = 1.15  # diagonals of the cells beside the edge: a cell that the edge cuts off ends within one
 

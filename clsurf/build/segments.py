@@ -21,6 +21,7 @@ AXES = 3  # directions that are enough while areas are small
 
 CONE = 60.0  # degrees: half the cone of a cap whose normals spread as an area's do
 FORCED_CONES = (75.0, 89.0, 180.0)  # tried in turn where a number of areas is asked for that CONE does not reach
+DIAGONAL = 1.45  # how much wider than the sides a rectangle may be
 CREASE = 60.0  # degrees: mean angle over a common border that no area crosses
 CREASE_COST = 20.0  # times as far across a crease while areas grow
 TURN_COST = 4.0  # growing across an edge: its length times 1 + TURN_COST (1 - cosine) / 2
@@ -127,11 +128,14 @@ class Merging:
         How many of `DIRECTIONS` widths are measured along.
     widest : float
         Areas may not become wider, world units.
+    fits : callable, optional
+        Asked before areas that would become wider than `widest`, up to `DIAGONAL` times, are merged: called with the
+        owner (f,) of every face among the k pairs of areas in question, -1 for the others, and k; returns (k,) bool.
     """
 
     def __init__(self, graph: FaceGraph, owner: NDArray, count: int, directions: int = len(DIRECTIONS),
-                 widest: float = np.inf):
-        self.owner, self.count, self.widest = owner, count, widest
+                 widest: float = np.inf, fits=None):
+        self.owner, self.count, self.widest, self.fits = owner, count, widest, fits
         self.area = np.bincount(owner, graph.area, count)
         self.normal = sums(owner, graph.area[:, None] * graph.normal, count)
         a, b = owner[graph.pairs].T
@@ -147,12 +151,13 @@ class Merging:
         # Rows: the largest value along each direction, then the largest along its opposite.
         self.reach = np.stack([np.maximum.reduceat(np.maximum(np.maximum(row[corner[0]], row[corner[1]]),
                                                               row[corner[2]]), starts) for row in along])
-        self._set_pairs(a, b, graph.bend, graph.length)
+        self._set_pairs(a, b, graph.bend, graph.length, np.zeros(len(a), bool))
 
-    def _set_pairs(self, a, b, bend, length):
+    def _set_pairs(self, a, b, bend, length, banned):
         """Keep every pair of neighbouring areas once, with the bend and length of the border between them."""
         apart = a != b
         a, b, bend, length = np.minimum(a, b)[apart], np.maximum(a, b)[apart], bend[apart], length[apart]
+        banned = banned[apart]
         key = a * np.int64(self.count) + b
         order = ordered(key)
         key = key[order]
@@ -160,9 +165,10 @@ class Merging:
         self.a, self.b = a[order[first]], b[order[first]]
         self.border_bend = np.add.reduceat(bend[order], first) if len(first) else bend
         self.border_length = np.add.reduceat(length[order], first) if len(first) else length
+        self.banned = np.logical_or.reduceat(banned[order], first) if len(first) else banned  # they only grow
 
-    def _costs(self, least_cosine: float) -> NDArray:
-        """Return what merging each pair adds to the cost; inf where it is not allowed."""
+    def _costs(self, least_cosine: float) -> tuple[NDArray, NDArray]:
+        """Return what merging each pair adds to the cost, inf where it is not allowed, and the width of both."""
         a, b, half = self.a, self.b, len(self.reach) // 2
         own, width = np.zeros(self.count, np.float32), np.zeros(len(a), np.float32)
         for high, low in zip(self.reach[:half], self.reach[half:], strict=True):
@@ -177,8 +183,9 @@ class Merging:
         cost = (width ** 3 * (self.bend[a] + self.bend[b] + self.border_bend + self.least_bend * area)
                 - energy[a] - energy[b]) * np.maximum(cosine, 0.05) ** -STEEP_COST
         crease = self.border_bend > 2 * (1 - np.cos(np.radians(CREASE))) * self.border_length
-        banned = (cosine < least_cosine) | (width > self.widest) | (crease & (least_cosine > -1))
-        return np.where(banned, np.inf, cost)
+        widest = self.widest * (1 if self.fits is None else DIAGONAL)
+        banned = self.banned | (cosine < least_cosine) | (width > widest) | (crease & (least_cosine > -1))
+        return np.where(banned, np.inf, cost), width
 
     def merge(self, target: int, cone: float = CONE, step=None) -> None:
         """Merge until `target` areas are left, or no two may be merged.
@@ -190,7 +197,7 @@ class Merging:
         while self.count > target:
             if step is not None:
                 step()
-            cost = self._costs(least_cosine)
+            cost, width = self._costs(least_cosine)
             best = np.full(self.count, np.inf)
             np.minimum.at(best, self.a, cost)
             np.minimum.at(best, self.b, cost)
@@ -205,7 +212,17 @@ class Merging:
             most = max(1, spare // 3) if self.count < 4 * target else spare
             if len(mutual) > most:
                 mutual = mutual[np.argsort(cost[mutual], kind="stable")[:most]]
-            self._apply(mutual)
+            self._apply(self._fitting(mutual, width[mutual]))
+
+    def _fitting(self, chosen, width) -> NDArray:
+        """Return which of the chosen pairs fit; the others are banned."""
+        doubtful = chosen[width > self.widest]
+        if self.fits is None or not len(doubtful):
+            return chosen
+        number = np.full(self.count, -1)
+        number[self.a[doubtful]] = number[self.b[doubtful]] = np.arange(len(doubtful))
+        self.banned[doubtful] = ~self.fits(number[self.owner], len(doubtful))
+        return chosen[~self.banned[chosen]]
 
     def _apply(self, chosen):
         keep, gone = self.a[chosen], self.b[chosen]
@@ -220,10 +237,10 @@ class Merging:
         self.area, self.bend, self.normal = self.area[stays], self.bend[stays], self.normal[stays]
         self.reach = np.ascontiguousarray(self.reach[:, stays])
         self.owner, self.count = number[self.owner], int(np.count_nonzero(stays))
-        self._set_pairs(number[self.a], number[self.b], self.border_bend, self.border_length)
+        self._set_pairs(number[self.a], number[self.b], self.border_bend, self.border_length, self.banned)
 
 
-def partition(graph: FaceGraph, target: int, widest: float = np.inf, exact: bool = False, step=None):
+def partition(graph: FaceGraph, target: int, widest: float = np.inf, exact: bool = False, step=None, fits=None):
     """Divide a mesh into areas.
 
     Parameters
@@ -238,6 +255,8 @@ def partition(graph: FaceGraph, target: int, widest: float = np.inf, exact: bool
         number of faces.
     step : callable, optional
         Called now and then.
+    fits : callable, optional
+        Allows areas that are wider, see `Merging`.
 
     Returns
     -------
@@ -256,7 +275,7 @@ def partition(graph: FaceGraph, target: int, widest: float = np.inf, exact: bool
         merging.merge(middle, step=step)
         owner = grown(graph, central_faces(graph, merging.owner, merging.count))
         count = merging.count
-    merging = Merging(graph, owner, count, widest=widest)
+    merging = Merging(graph, owner, count, widest=widest, fits=fits)
     merging.merge(target, step=step)
     for cone in FORCED_CONES if exact else ():
         merging.merge(target, cone, step)
@@ -310,8 +329,8 @@ def turned(graph: FaceGraph, owner: NDArray, count: int) -> NDArray:
 def split_faces(corners: NDArray, vertices: NDArray, longest: float) -> tuple[NDArray, list[NDArray], NDArray]:
     """Cut faces in such a way that no edge is longer than `longest`.
 
-    The longest edge of every face is halved, in all of its faces at once, until none is too long: needles are cut
-    across, not into ever more needles.
+    Edges that are the longest of all their faces are halved until none is too long: no face is then cut elsewhere,
+    needles are cut across, and no new ones arise.
 
     Returns
     -------
@@ -333,7 +352,7 @@ def split_faces(corners: NDArray, vertices: NDArray, longest: float) -> tuple[ND
         if not len(faces):
             break
         key = _edge_keys(faces, len(place))
-        chosen = np.unique(key[np.arange(len(faces)), length.argmax(axis=1)])
+        chosen = np.unique(key[_longest(key, length)])
         pair = np.stack(np.divmod(chosen, len(place)), axis=1)
         ends.append(pair)
         at = np.minimum(np.searchsorted(chosen, key), len(chosen) - 1)
@@ -352,16 +371,25 @@ def _edge_keys(faces, count) -> NDArray:
     return np.minimum(a, b) * np.int64(count) + np.maximum(a, b)
 
 
+def _longest(key, length) -> NDArray:
+    """Return which edges (f, 3) are the longest of all their faces, of equally long ones that of the largest key."""
+    edge, which = np.unique(key, return_inverse=True)
+    rank = np.empty(len(edge), np.int64)
+    size = np.zeros(len(edge))
+    size[which.ravel()] = length.ravel()
+    rank[np.lexsort((edge, size))] = np.arange(len(edge))
+    rank = rank[which.reshape(key.shape)]
+    first = rank == rank.max(axis=1, keepdims=True)
+    beaten = np.zeros(len(edge), bool)
+    beaten[which.reshape(key.shape)[~first]] = True
+    return first & ~beaten[which.reshape(key.shape)]
+
+
 def _cut(faces, source, cut):
-    """Return the parts of faces whose edges k to k + 1 are cut at the vertices `cut` (f, 3), -1 for none."""
-    count, parts = (cut >= 0).sum(axis=1), []
-    for number in (1, 2, 3):
-        some = np.flatnonzero(count == number)
-        # Turned so that with one cut it is edge 0, with two cuts edge 2 is whole.
-        turn = np.argmax(cut[some] >= 0, axis=1) if number == 1 else (np.argmin(cut[some] >= 0, axis=1) + 1) % 3
-        at = (turn[:, None] + np.arange(3)) % 3
-        (a, b, c), (x, y, z) = np.take_along_axis(faces[some], at, 1).T, np.take_along_axis(cut[some], at, 1).T
-        triples = {1: [(a, x, c), (x, b, c)], 2: [(x, b, y), (a, x, y), (a, y, c)],
-                   3: [(a, x, z), (x, b, y), (z, y, c), (x, y, z)]}[number]
-        parts += [(np.stack(triple, axis=1), source[some]) for triple in triples]
-    return np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts])
+    """Return the faces with those halved whose edge k to k + 1 has a vertex in `cut` (f, 3), at most one; -1: none."""
+    some = (cut >= 0).any(axis=1)
+    turned = (np.argmax(cut[some] >= 0, axis=1)[:, None] + np.arange(3)) % 3  # the edge comes first
+    a, b, c = np.take_along_axis(faces[some], turned, 1).T
+    x = cut[some].max(axis=1)
+    parts = [faces[~some], np.stack([a, x, c], axis=1), np.stack([x, b, c], axis=1)]
+    return np.concatenate(parts), np.concatenate([source[~some], source[some], source[some]])

@@ -97,7 +97,9 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
     FlatTriangle t = flat_triangle(frame, vertices, faces + 3 * (size_t)list[at]);
     float area = doubled_area(&t), side = area < 0.0f ? -1.0f : 1.0f, weight[3];
     if (!own && area <= FLAT_AREA) continue;  // what faces down is another side of the surface
-    NodeBox box = nodes_around(&t, own ? REACH : 0.0f, m, n);
+    __global const int *corners = faces + 3 * (size_t)list[at];
+    bool at_edge = cut[corners[0]] + cut[corners[1]] + cut[corners[2]] > 1;
+    NodeBox box = nodes_around(&t, own || at_edge ? REACH : 0.0f, m, n);
     for (int j = box.j0; j <= box.j1; j++)
       for (int i = box.i0; i <= box.i1; i++) {
         int k = first + j * m + i;
@@ -111,7 +113,7 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
           if (d2 > distance[k] || (d2 == distance[k] && z <= heights[k])) continue;
           distance[k] = d2;
           heights[k] = z;
-          source[k] = beyond_cut(weight, d2, faces + 3 * (size_t)list[at], cut) ? CUT - list[at] : list[at];
+          source[k] = beyond_cut(weight, d2, corners, cut) ? CUT - list[at] : list[at];
         } else if (d2 == 0.0f) {
           // heights[k] goes on holding the own plane, distance[k] takes the height found
           float z = weight[0] * t.z[0] + weight[1] * t.z[1] + weight[2] * t.z[2], miss = fabs(z - heights[k]);
@@ -119,6 +121,8 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
           distance[k] = z;
           source[k] = list[at];
           gap[k] = miss;
+        } else if (gap[k] >= CARRIED && d2 < distance[k] && beyond_cut(weight, d2, corners, cut)) {
+          source[k] = CUT - list[at];  // the edge goes on beside the own faces
         }
       }
   }
