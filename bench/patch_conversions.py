@@ -14,13 +14,13 @@ from clsurf.render.renderer import Renderer
 from clsurf.surface.cloud import PointCloud
 
 from . import record, scenes, truth, views
-from .patch_coverage import coverage
+from .patch_coverage import coverage, point_spacing
 from .patch_quality import quality
 from .table import print_table
 
 MESHES = {"bunny": {"patches": 1526}, "fandisk": {}}  # the paper's number
 HEAD = 837  # patches, the paper's
-SAMPLES = 50_000  # of a mesh and of its patches that distances are measured from
+SAMPLES = 20_000  # of a mesh and of its patches that distances are measured from
 SCANS = {"bunny scans": "range_scans/bunny/bun.conf", "happy scans": "range_scans/happy/happyStandRight.conf",
          "lion": "coloured/lion_takanawa.copc.laz"}
 PICTURE = (500, 500)
@@ -78,12 +78,18 @@ def cloud_figures(scan, device, **options) -> tuple[dict, object]:
     start = time.perf_counter()
     surface = build_patches(scan, device=device, **options)
     seconds = time.perf_counter() - start
-    cloud = scan if isinstance(scan, PointCloud) else scan.to_points()
-    found = coverage(surface, cloud.points.astype(np.float64) + cloud.origin)
+    cloud, spacing = (scan, None) if isinstance(scan, PointCloud) else (scan.to_points(), image_spacing(scan))
+    found = coverage(surface, cloud.points.astype(np.float64) + cloud.origin, spacing)
     return {"build": record.timing([seconds]), "patches": len(surface), "nodes": surface.node_count,
             "points": len(cloud.points), "points_covered": found.points_covered,
             "nodes_supported": found.nodes_supported,
             "node_spacings": found.node_spacing / found.point_spacing}, surface
+
+
+def image_spacing(scan) -> float:
+    """Return the median over range images of the point spacing in each: where images overlap, points lie closer."""
+    points = (image.sensor_points().reshape(-1, 3).astype(np.float64) for image in scan.images)
+    return float(np.median([point_spacing(p[np.isfinite(p).all(axis=1)]) for p in points]))
 
 
 def first_frame(folder, device) -> dict:

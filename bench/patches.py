@@ -56,7 +56,8 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
     """Return the figures of spatial patches; `device` is an opened one."""
     surfaces = made(quick)
     figures = {"models": {name: sizes_of(surface) for name, surface in surfaces.items()}}
-    figures["pictures"] = pictures(surfaces, device, CHECKED[quick], VIEWS[:1] if quick else VIEWS)
+    closed = {name: surfaces[name] for name in ("sphere", main_earth(surfaces))}
+    figures["pictures"] = pictures(closed, device, CHECKED[quick], VIEWS[:1] if quick else VIEWS)
     if not quick:
         figures["conversions"], converted = patch_conversions.measure(device)
         surfaces |= converted
@@ -64,7 +65,7 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
     cases = chosen_cases(surfaces, quick)
     figures["frames"] = frames(cases, surfaces, device, 8 if quick else 24)
     earth = main_earth(surfaces)
-    figures["modes"] = modes(earth, surfaces[earth], device, 8 if quick else 24, SMALL if quick else PAPER)
+    figures["modes"] = modes(earth, surfaces[earth], device, 8 if quick else 16, SMALL if quick else PAPER)
     figures["tables"] = patch_tables.measure(surfaces, PAPER, SMALL)
     if profile:
         figures["stages"] = {case.name: stages(case, surfaces[case.scene], device) for case in cases}
@@ -160,7 +161,7 @@ def frames(cases, surfaces, device, count: int) -> dict:
             if windows[case.name] is not None:
                 together |= {case.name: runners[case.name],
                              (case.name, "vtk"): lambda camera, w=windows[case.name], s=case.size: w.seconds(camera, s)}
-        seconds, _ = in_turns(together, orbits, min(count, 16)) if together else ({}, None)
+        seconds, _ = in_turns(together, orbits, min(count, 8)) if together else ({}, None)
     for name, window in windows.items():
         if window is None:
             continue
