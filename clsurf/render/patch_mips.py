@@ -24,6 +24,24 @@ def mip_levels(surface: PatchSurface, most: int = 8) -> list[PatchSurface]:
     return levels
 
 
+def with_levels(surface: PatchSurface, most: int) -> tuple[PatchSurface, int]:
+    """Return one surface of all levels, patch after patch, and the number of levels.
+
+    Level l of patch k is patch ``k * levels + l``; a patch's finest level that has 2 x 2 nodes stands for coarser ones.
+    """
+    levels = mip_levels(surface, most)
+    count = len(levels)
+    patch = np.concatenate([np.repeat(np.arange(len(s)), np.diff(s.node_offset)) for s in levels])
+    order = np.argsort(patch, kind="stable")
+    mixed = lambda name: np.stack([getattr(s, name) for s in levels], axis=1).reshape(  # noqa: E731
+        len(surface) * count, *getattr(surface, name).shape[1:])
+    colors = None if surface.colors is None else np.concatenate([s.colors for s in levels])[order]
+    return PatchSurface(
+        mixed("origins"), mixed("axis_x"), mixed("axis_y"), mixed("axis_z_length"), mixed("size"),
+        np.concatenate([s.displacements for s in levels])[order], colors, surface.color, surface.origin,
+        surface.diagonal, surface.bound, surface.bound_share, surface.oriented), count
+
+
 def halved(surface: PatchSurface) -> PatchSurface:
     """Return the next coarser level of a surface.
 

@@ -13,6 +13,7 @@ from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
 from .patch_drawing import PatchDrawing
+from .patch_forms import mark_levels, select_levels, surface_form
 from .patch_lattice import CELLS
 from .patch_nodes import LIT_UNIT, light_nodes, table_normals
 from .patch_tiles import NODES, PAD, tile_patches
@@ -180,8 +181,15 @@ def shade_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpl
 
 def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, out=None) -> None:
     """Run the stages of one surface: project, work at the nodes where a mode asks for it, tile."""
-    drawing = look.patches
+    drawing, levels = look.patches, None
+    form = surface_form(device, upload, upload_patches, floats, drawing)
+    if form is not None:
+        upload, levels = form.upload, None
+        if form.levels > 1:
+            upload, levels = select_levels(device, scratch, form, view)
     projected = project_patches(device, scratch, upload, view, drawing)
+    if levels is not None:
+        mark_levels(device, projected.records, levels, upload.count)
     constants = patch_constants(upload)
     if drawing.normal_table:
         nodes, _ = table_normals(device, scratch, upload, constants, projected.rectangles, drawing.normal_table)

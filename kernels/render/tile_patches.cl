@@ -4,6 +4,7 @@
 // VW > 1: one work-item per tile; lanes are the cells of a row, or 4x4 pixels of one cell where cells are large. VW = 1:
 // one work-group of 64 work-items per tile, each a cell, then a pixel. Twin: tests/reference/render_patches.py.
 #include "render/patch_cells.clh"
+#include "render/patch_heights.clh"
 #include "render/shade.clh"
 
 #ifndef TILE_BINS
@@ -191,42 +192,9 @@ INLINE Spot spot_at(__global const float *h, int perspective, VF i, VF j, VF d, 
   return s;
 }
 
-// A patch all of which is in front of the eye, lanes over rows of cells. VW = 1: `item` of the group's cells.
-INLINE void draw_patch(const Target *to, Nodes nodes, __global const float *h, int perspective, uint first, int m, int n,
-                       int large, int item) {
-#if VW == 1
-  for (int cell = item; cell < (m - 1) * (n - 1); cell += GROUP) {
-    int i = cell % (m - 1), j = cell / (m - 1);
-    uint at = first + (uint)j * m + i;
-    int rim = nodes.rims[at];
-    if (!(rim & RIM_DRAWN)) continue;
-#define SPOT(i, j, at) spot_at(h, perspective, i, j, nodes.steps[at], nodes.rims[at])
-    draw_cells(to, SPOT(i, j, at), SPOT(i + 1, j, at + 1), SPOT(i, j + 1, at + m), SPOT(i + 1, j + 1, at + m + 1), 1,
-               large, at);
-  }
-#else
-  for (int i = 0; i < m - 1; i += VW) {
-    VF left = TO_VF((VI)(i) + LANE_INDEX), right = left + 1.0f;
-    VI inside = (VI)(i) + LANE_INDEX < (VI)(m - 1), before;
-    Spot a, b, c, d;
-    for (int j = 0; j < n; j++) {
-      uint at = first + (uint)j * m + i;
-      VI rim = RIMS_AT(nodes.rims + at);
-      c = spot_at(h, perspective, left, (VF)(j), FLOATS_AT(nodes.steps + at), rim);
-      d = spot_at(h, perspective, right, (VF)(j), FLOATS_AT(nodes.steps + at + 1), RIMS_AT(nodes.rims + at + 1));
-      if (j > 0) {
-        VI drawn = inside & ((before & RIM_DRAWN) != 0);
-        if (any_lane(drawn)) draw_cells(to, a, b, c, d, drawn, large, at - m);
-      }
-      a = c; b = d; before = rim;
-    }
-  }
-#endif
-}
-
 // One cell, lanes over 4x4 pixels; the corners may lie behind the eye (`clipped`).
-INLINE void draw_one(const Target *to, const VF *x, const VF *y, const VF *z, const VF *w, const VF *r, int clipped,
-                     uint payload) {
+INLINE void draw_one(const Target *to, const VF *x, const VF *y, const VF *z, const VF *w, const VF *r, const VF *alphas,
+                     int clipped, uint payload) {
   float near = to->view[NEAR], x0 = INFINITY, x1 = -INFINITY, y0 = INFINITY, y1 = -INFINITY, extent = 0.0f;
   float X[4], Y[4], Z[4], W[4];
   for (int k = 0; k < 4; k++) {
@@ -294,6 +262,9 @@ INLINE void draw_one(const Target *to, const VF *x, const VF *y, const VF *z, co
                                x[2] - px * w[2], y[2] - py * w[2], x[3] - px * w[3], y[3] - py * w[3], z[0], z[1], z[2],
                                z[3], near, &s, &t, &depth);
         hit = hit & (off == 0.0f);
+#if ALPHA_TEST
+        hit = hit & (mixed(alphas[0], alphas[1], alphas[2], alphas[3], s, t) >= HALF_ALPHA);
+#endif
         VF p = r[0] + s * (r[1] - r[0]), q = r[2] + s * (r[3] - r[2]);
         key = key_of(layer_of(to->view, depth), p + t * (q - p));
       } else {
@@ -302,6 +273,12 @@ INLINE void draw_one(const Target *to, const VF *x, const VF *y, const VF *z, co
         hit = hit & (odd ? in_folded(ax, ay, bx, by, cx, cy, dx, dy) : in_convex(ax, ay, bx, by, cx, cy, dx, dy));
         if (!any_lane(hit)) continue;
         key = fit_key(to->view, &fit, px, py, 1);
+#if ALPHA_TEST
+        VF s, t, depth;
+        place_in_cell(x[0] - px * w[0], y[0] - py * w[0], x[1] - px * w[1], y[1] - py * w[1], x[2] - px * w[2],
+                      y[2] - py * w[2], x[3] - px * w[3], y[3] - py * w[3], z[0], z[1], z[2], z[3], near, &s, &t, &depth);
+        hit = hit & (mixed(alphas[0], alphas[1], alphas[2], alphas[3], s, t) >= HALF_ALPHA);
+#endif
       }
       if (!any_lane(hit)) continue;
 #if VW == 1
@@ -321,24 +298,85 @@ INLINE void draw_one(const Target *to, const VF *x, const VF *y, const VF *z, co
     }
 }
 
+// One cell by itself.
+INLINE void draw_alone(const Target *to, Nodes nodes, __global const float *h, int perspective, uint first, int m, int i,
+                       int j) {
+  float near = to->view[NEAR];
+  uint at = first + (uint)j * m + i;
+  int front = 0, shown = !ALPHA_TEST;
+  VF x[4], y[4], z[4], w[4], r[4], alphas[4];
+  for (int k = 0; k < 4; k++) {
+    uint node = at + (k >> 1) * m + (k & 1);
+    project_nodes(h, perspective, (VF)(i + (k & 1)), (VF)(j + (k >> 1)), (VF)(nodes.steps[node]), x + k, y + k, z + k,
+                  w + k);
+    r[k] = (nodes.rims[node] & RIM_BORDER) * RIM_SCALE;
+    front += ((const float *)(z + k))[0] > near;
+#if ALPHA_TEST
+    alphas[k] = nodes.nodes[node].z >> 16;
+    shown |= nodes.nodes[node].z >> 31;  // a half or more
+#endif
+  }
+  if (front && shown) draw_one(to, x, y, z, w, r, alphas, front < 4, at);
+}
+
 // A patch of large cells, or one that reaches the near plane, cell by cell.
 INLINE void draw_large(const Target *to, Nodes nodes, __global const float *h, int perspective, uint first, int m, int n,
                        int item) {
-  float near = to->view[NEAR];
   for (int cell = item; cell < (m - 1) * (n - 1); cell += GROUP) {
-    int i = cell % (m - 1), j = cell / (m - 1), front = 0;
-    uint at = first + (uint)j * m + i;
-    if (!(nodes.rims[at] & RIM_DRAWN)) continue;
-    VF x[4], y[4], z[4], w[4], r[4];
-    for (int k = 0; k < 4; k++) {
-      uint node = at + (k >> 1) * m + (k & 1);
-      project_nodes(h, perspective, (VF)(i + (k & 1)), (VF)(j + (k >> 1)), (VF)(nodes.steps[node]), x + k, y + k, z + k,
-                    w + k);
-      r[k] = (nodes.rims[node] & RIM_BORDER) * RIM_SCALE;
-      front += ((const float *)(z + k))[0] > near;
-    }
-    if (front) draw_one(to, x, y, z, w, r, front < 4, at);
+    int i = cell % (m - 1), j = cell / (m - 1);
+    if (nodes.rims[first + (uint)j * m + i] & RIM_DRAWN) draw_alone(to, nodes, h, perspective, first, m, i, j);
   }
+}
+
+#if ALPHA_TEST
+// Whether all corners of a cell have at least half an alpha, so that all of it shows.
+INLINE int is_whole(Nodes nodes, uint at, int m) {
+  return nodes.nodes[at].z & nodes.nodes[at + 1].z & nodes.nodes[at + m].z & nodes.nodes[at + m + 1].z & 0x80000000u ? -1 : 0;
+}
+#endif
+
+// A patch all of which is in front of the eye, lanes over rows of cells. VW = 1: `item` of the group's cells.
+INLINE void draw_patch(const Target *to, Nodes nodes, __global const float *h, int perspective, uint first, int m, int n,
+                       int large, int item) {
+#if VW == 1
+  for (int cell = item; cell < (m - 1) * (n - 1); cell += GROUP) {
+    int i = cell % (m - 1), j = cell / (m - 1);
+    uint at = first + (uint)j * m + i;
+    int rim = nodes.rims[at];
+    if (!(rim & RIM_DRAWN)) continue;
+#if ALPHA_TEST
+    if (!is_whole(nodes, at, m)) { draw_alone(to, nodes, h, perspective, first, m, i, j); continue; }
+#endif
+#define SPOT(i, j, at) spot_at(h, perspective, i, j, nodes.steps[at], nodes.rims[at])
+    draw_cells(to, SPOT(i, j, at), SPOT(i + 1, j, at + 1), SPOT(i, j + 1, at + m), SPOT(i + 1, j + 1, at + m + 1), 1,
+               large, at);
+  }
+#else
+  for (int i = 0; i < m - 1; i += VW) {
+    VF left = TO_VF((VI)(i) + LANE_INDEX), right = left + 1.0f;
+    VI inside = (VI)(i) + LANE_INDEX < (VI)(m - 1), before;
+    Spot a, b, c, d;
+    for (int j = 0; j < n; j++) {
+      uint at = first + (uint)j * m + i;
+      VI rim = RIMS_AT(nodes.rims + at);
+      c = spot_at(h, perspective, left, (VF)(j), FLOATS_AT(nodes.steps + at), rim);
+      d = spot_at(h, perspective, right, (VF)(j), FLOATS_AT(nodes.steps + at + 1), RIMS_AT(nodes.rims + at + 1));
+      if (j > 0) {
+        VI drawn = inside & ((before & RIM_DRAWN) != 0);
+#if ALPHA_TEST
+        for (uint bits = lane_mask(drawn); bits; bits &= bits - 1) {
+          int l = FIRST_LANE(bits);
+          if (is_whole(nodes, at - m + l, m)) continue;
+          ((int *)&drawn)[l] = 0;
+          draw_alone(to, nodes, h, perspective, first, m, i + l, j - 1);
+        }
+#endif
+        if (any_lane(drawn)) draw_cells(to, a, b, c, d, drawn, large, at - m);
+      }
+      a = c; b = d; before = rim;
+    }
+  }
+#endif
 }
 
 // A patch whose cells are nowhere larger than a pixel: every node into the pixel it falls into.
@@ -363,7 +401,6 @@ INLINE void draw_nodes(const Target *to, Nodes nodes, __global const float *h, i
   }
 }
 
-#include "render/patch_heights.clh"
 #if LATTICE
 #include "render/patch_lattice.clh"
 #endif

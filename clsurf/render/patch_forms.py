@@ -1,0 +1,92 @@
+"""The forms of a surface that modes draw: with coarser levels for minification, with nodes carried on for alpha.
+
+A form is uploaded when the first frame needs it. Kernels: kernels/render/*_levels.cl, pack_alphas.cl.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device, DeviceArray
+from ..surface.patch import PatchSurface
+from .patch_alpha import extended
+from .patch_mips import with_levels
+from .tiles import Scratch
+
+LEVELS = 8  # most levels of a surface
+WIDEST_SPACING_PX = 1.0  # the coarsest level whose nodes are at most this far apart is drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """A surface as one mode draws it, on a device."""
+
+    upload: object  # PatchUpload: patch k's level l is its patch k * levels + l
+    levels: int
+    surface: PatchSurface  # the upload refers to it weakly
+
+
+def surface_form(device: Device, upload, put, view: NDArray, drawing):
+    """Return the `Form` that a frame draws `upload` in; None: as it is.
+
+    Parameters
+    ----------
+    upload : PatchUpload
+    put : callable
+        ``put(device, surface)`` gives the upload of a surface.
+    view : (32,) float32
+        The view buffer of the placed surface.
+    drawing : PatchDrawing
+    """
+    # The table of normals holds the normals of a patch's own nodes.
+    minified = drawing.mip and not drawing.normal_table and least_spacing_px(upload, view) <= WIDEST_SPACING_PX / 2
+    if not (minified or drawing.alpha):
+        return None
+
+    def make(surface):
+        levels, alphas = 1, None
+        if minified:
+            surface, levels = with_levels(surface, LEVELS)
+        if drawing.alpha:
+            surface, alphas = extended(surface)
+        made = put(device, surface)
+        if alphas is not None:
+            nodes = max(surface.node_count, 1)
+            device.kernel("render/pack_alphas.cl")((nodes,), (64,), device.upload(np.pad(alphas, (0, 64))),
+                                                   surface.node_count, made.nodes)
+        return Form(made, levels, surface)
+
+    return upload.once(("form", bool(minified), drawing.alpha), make)
+
+
+def least_spacing_px(upload, view: NDArray) -> float:
+    """Return the least distance in pixels that two nodes of a surface's finest patch may have in the picture."""
+    least = upload.once("least_spacing", _least_spacing)
+    scale, offset, focal = float(view[9]), view[10:13].astype(np.float64), float(min(view[13], view[14]))
+    farthest = scale * upload.reach - (scale * view[6:9].astype(np.float64) @ upload.center + offset[2])
+    return least * scale * focal / (max(farthest, 1e-30) if view[17] > 0 else 1.0)
+
+
+def _least_spacing(surface: PatchSurface) -> float:
+    return min(float(np.linalg.norm(axis.astype(np.float64), axis=1).min(initial=np.inf))
+               for axis in (surface.axis_x, surface.axis_y))
+
+
+def select_levels(device: Device, scratch: Scratch, form: Form, view: DeviceArray):
+    """Choose a level for every patch; return the upload of the chosen ones, and the levels (p,) int32."""
+    all_ = form.upload
+    count = all_.count // form.levels
+    frames = scratch.array("level_frames", (max(count, 1), all_.frames.shape[1]), np.float32)
+    sizes = scratch.array("level_sizes", (max(count, 1), 2), np.int32)
+    offsets = scratch.array("level_offsets", (count + 1,), np.uint32)
+    levels = scratch.array("levels", (max(count, 1),), np.int32)
+    device.kernel("render/select_levels.cl")(
+        (count + 1,), (16,), view, all_.frames, all_.sizes, all_.offsets, count, form.levels, WIDEST_SPACING_PX, frames,
+        sizes, offsets, levels)
+    return replace(all_, count=count, frames=frames, sizes=sizes, offsets=offsets, equal_nodes=0), levels
+
+
+def mark_levels(device: Device, records: DeviceArray, levels: DeviceArray, count: int) -> None:
+    """Write the levels into the flags of projected patches."""
+    device.kernel("render/mark_levels.cl")((count,), (16,), records, records.shape[1], levels, count)
