@@ -18,7 +18,7 @@ from .patch_error import patch_distances
 from .patch_strips import cells_beside, cut_graph, fitting_strips, joined, strip_faces, strip_frames
 from .quantize import quantized
 from .resample import REACH, FaceLists, Frames, area_lists, has_colors, resample_faces
-from .segments import FaceGraph, face_graph, partition, split_faces
+from .segments import FaceGraph, face_graph, partition, split_faces, sums
 
 NODES_A_VERTEX = 441_014 / 34_834  # of the paper's bunny (Table 1): the mesh's own resolution
 ANGLES = 12  # within 90 degrees, that rectangles around areas are tried at
@@ -92,7 +92,8 @@ def converted(mesh: Mesh, request, device, progress) -> Conversion:
     graph = cut_graph(graph, strips) if len(strips) else graph
     widest = WIDEST * width if request.spacing else np.inf
     count = 1 if request.spacing else max(1, count - len(strips))
-    owner, count = partition(graph, count, widest, exact=bool(request.patches), step=lambda: progress(0.5, "areas"))
+    owner, count = partition(graph, count, widest, exact=bool(request.patches), step=lambda: progress(0.5, "areas"),
+                             fits=_fitting(graph, spans, request.spacing) if request.spacing else None)
     frames, owner = framed(graph, owner, count, request.nodes, request.spacing)
     progress(0.0, "nodes")
     lists = area_lists(owner, len(frames), graph.corners)
@@ -170,7 +171,7 @@ def framed(graph: FaceGraph, owner: NDArray, count: int, nodes, spacing: float |
     """
     spans = np.asarray(nodes) - 1 - 2 * (REACH - 1)
     normal = graph.normals_of(owner, count)
-    box = _rectangles(graph, owner, count, normal, spans)
+    box = _rectangles(graph.vertices, graph.corners, owner, count, normal, spans)
     while spacing is not None:
         large = np.flatnonzero((box.high - box.low > spans * spacing * (1 + 1e-9)).any(axis=1))
         halved, more = _halved(graph, owner, count, large, box)
@@ -178,7 +179,7 @@ def framed(graph: FaceGraph, owner: NDArray, count: int, nodes, spacing: float |
             break
         owner, count = halved, more
         normal = graph.normals_of(owner, count)
-        box = _rectangles(graph, owner, count, normal, spans)
+        box = _rectangles(graph.vertices, graph.corners, owner, count, normal, spans)
     step = ((box.high - box.low) / spans).max(axis=1)
     least = max(np.ptp(graph.vertices, axis=0).max() * 1e-6, 1e-30)  # an area of one face without extent
     step = np.full(count, spacing, np.float64) if spacing is not None else np.maximum(step, least)
@@ -199,18 +200,31 @@ class Rectangles:
     height: NDArray  # (p,) float64: mean of the area along its normal
 
 
-def _rectangles(graph, owner, count, normal, spans) -> Rectangles:
+def _fitting(graph: FaceGraph, spans, spacing: float):
+    """Return the function that tells which areas have a rectangle within `spans` node spacings."""
+    def fits(owner, count):
+        faces = np.flatnonzero(owner >= 0)
+        owner = owner[faces]
+        total = sums(owner, graph.area[faces, None] * graph.normal[faces], count)
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        normal = np.where(length > 0, total / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+        box = _rectangles(graph.vertices, graph.corners[faces], owner, count, normal, spans)
+        return (box.high - box.low <= spans * spacing).all(axis=1)
+    return fits
+
+
+def _rectangles(vertices, corners, owner, count, normal, spans) -> Rectangles:
     """Return for every area the rectangle that asks for the least spacing."""
     sign = np.where(normal[:, 2] < 0, -1.0, 1.0)
     a = -1 / (sign + normal[:, 2])
     b = normal[:, 0] * normal[:, 1] * a
     u = np.stack([1 + sign * normal[:, 0] ** 2 * a, sign * b, -sign * normal[:, 0]], axis=1)
     v = np.stack([b, sign + normal[:, 1] ** 2 * a, -normal[:, 1]], axis=1)
-    key = (owner[:, None] * np.int64(len(graph.vertices)) + graph.corners).ravel()
+    key = (owner[:, None] * np.int64(len(vertices)) + corners).ravel()
     key.sort()
-    area, vertex = np.divmod(key[np.append(True, key[1:] != key[:-1])], len(graph.vertices))
+    area, vertex = np.divmod(key[np.append(True, key[1:] != key[:-1])], len(vertices))
     starts = np.searchsorted(area, np.arange(count))
-    place = graph.vertices[vertex]
+    place = vertices[vertex]
     x, y, z = (np.einsum("ij,ij->i", place, axis[area]) for axis in (u, v, normal))
     best, found = np.full(count, np.inf), np.zeros((count, 5))
     turns = ANGLES if spans[0] == spans[1] else 2 * ANGLES

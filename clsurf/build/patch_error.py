@@ -17,13 +17,13 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray,
     points : (n, 3) float64
         Relative to the surface's origin.
     to_nodes : bool
-        Measure points whose cell is not opaque to the patch's nodes; otherwise they are at inf.
+        Measure points whose cell is not opaque to cells near by, or to the patch's nodes; otherwise they are at inf.
 
     Returns
     -------
     upper : (n,) float64
         World units, never less than the distance to the surface: along the patch's z where the point's cell is opaque,
-        otherwise to the patch's nearest opaque node.
+        otherwise to a point of the opaque cells around, or to the patch's nearest opaque node.
     near : (n,) float64
         The first one times the cosine of the cell's slope: the distance itself, to first order.
     """
@@ -44,8 +44,39 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray,
     slope_y = ((1 - u) * (d[2] - d[0]) + u * (d[3] - d[1])) * lengths[2] / lengths[1]
     near = upper / np.sqrt(1 + slope_x ** 2 + slope_y ** 2)
     outside = np.flatnonzero(~inside)
-    upper[outside] = near[outside] = _to_nodes(surface, patch[outside], points[outside]) if to_nodes else np.inf
+    upper[outside] = near[outside] = np.inf
+    if to_nodes and len(outside):
+        local = np.stack([i, j, k], axis=1)[outside]
+        upper[outside] = near[outside] = _to_cells(surface, patch[outside], local, np.stack(lengths, axis=1)[outside])
+        far = outside[~np.isfinite(upper[outside])]
+        upper[far] = near[far] = _to_nodes(surface, patch[far], points[far])
     return upper, near
+
+
+def _to_cells(surface, patch, local, lengths) -> NDArray:
+    """Return the least distance (n,) of points to the points over or nearest to them in the 5 x 5 cells around.
+
+    Parameters
+    ----------
+    local : (n, 3) float64
+        Node steps and displacement steps.
+    lengths : (n, 3) float64
+        World units of these.
+    """
+    best, opaque = np.full(len(patch), np.inf), surface.opaque
+    m, n = surface.size[patch].T.astype(np.int64)
+    base = np.clip(np.floor(local[:, 0]), 0, m - 2), np.clip(np.floor(local[:, 1]), 0, n - 2)
+    for shift in np.ndindex(5, 5):
+        column = np.clip(base[0] + shift[0] - 2, 0, m - 2).astype(np.int64)
+        row = np.clip(base[1] + shift[1] - 2, 0, n - 2).astype(np.int64)
+        at = surface.node_offset[patch] + row * m + column
+        corners = np.stack([at, at + 1, at + m, at + m + 1])
+        u, v = np.clip(local[:, 0] - column, 0, 1), np.clip(local[:, 1] - row, 0, 1)
+        d = surface.displacements[corners].astype(np.float64)
+        z = (1 - v) * ((1 - u) * d[0] + u * d[1]) + v * ((1 - u) * d[2] + u * d[3])
+        gap = np.linalg.norm((local - np.stack([column + u, row + v, z], axis=1)) * lengths, axis=1)
+        best = np.minimum(best, np.where(opaque[corners].all(axis=0), gap, np.inf))
+    return best
 
 
 def _to_nodes(surface, patch, points) -> NDArray:
