@@ -114,9 +114,13 @@ def _measured(scan: RangeScan, request, spacing: float, device: Device, progress
     field = range_field(scan, device, lambda done: progress(0.3 * done, "samples"))
     progress(0.3, "fragments")
     fragments = find_fragments(field, nodes, ratio, device)
+    places = places_of(field, fragments, nodes, ratio)
+    if len(fragments) and request.spacing is not None:  # slanted views stretch samples: once more, by how much they do
+        ratio *= min(1.0, spacing / float(np.median(places.steps)))
+        fragments = find_fragments(field, nodes, ratio, device)
+        places = places_of(field, fragments, nodes, ratio)
     if not len(fragments):
         raise InputError("scan: expected samples that form a surface, got only scattered ones")
-    places = places_of(field, fragments, nodes, ratio)
     progress(0.5, "nodes")
     kept = np.arange(len(fragments))
     own = own_rects(field, fragments, kept)
@@ -303,7 +307,7 @@ def bound_of(scan: RangeScan, field: RangeField, fragments: Fragments, places: P
     at = np.flatnonzero((codes & 127) <= FULL)
     pair, sample = _samples_at(field, pairs, counts, at)
     nearest = np.full(len(field.cells), np.inf)
-    np.minimum.at(nearest, sample, (codes[at] & 127) / FULL * places.tolerance[pairs[pair, 0]])
+    np.minimum.at(nearest, sample, ((codes[at] & 127) / FULL) ** 2 * places.tolerance[pairs[pair, 0]])
     asked = np.concatenate([(image.valid & (np.add.outer(*map(np.arange, image.shape)) % 2 == 0)).ravel()
                             for image in scan.images])
     found = np.sort(nearest[asked & np.isfinite(nearest)])

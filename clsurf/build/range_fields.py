@@ -180,14 +180,20 @@ def smooth_depth(disparity: NDArray, radius: int, gate: float, device: Device) -
 
 
 def noise_of(values: NDArray) -> float:
-    """Return the 90th percentile of the second differences along the rows of (h, w), 0 where there are none.
+    """Return the noise along the rows of (h, w) as the 90th percentile of second differences, 0 where there are none.
 
-    A quantised sensor gives its step, a smooth noise-free surface next to nothing.
+    A quantised sensor gives its step. Of smooth surfaces the second differences are their bending: the fourth ones,
+    scaled to what they are for white noise, are next to nothing there, so the smaller of both is taken.
     """
     second = values[:, :-2] - 2 * values[:, 1:-1] + values[:, 2:]
-    second = np.abs(second[np.isfinite(second)])
-    rank = int(0.9 * (len(second) - 1))
-    return float(np.partition(second, rank)[rank]) if len(second) else 0.0
+    fourth = second[:, :-2] - 2 * second[:, 1:-1] + second[:, 2:]
+    return min(_percentile(second), _percentile(fourth) * (6 / 70) ** 0.5)
+
+
+def _percentile(values: NDArray) -> float:
+    values = np.abs(values[np.isfinite(values)])
+    rank = int(0.9 * (len(values) - 1))
+    return float(np.partition(values, rank)[rank]) if len(values) else 0.0
 
 
 def _place_samples(image: RangeImage, values: DeviceArray, origin, first: int, samples: DeviceArray, device: Device):

@@ -1,7 +1,7 @@
 // How far the samples of fragments lie from patches, one work-item a pair of a patch and a fragment.
 //
-// A byte for each corner of the cells in the fragment's rectangle: the distance along the patch's axis over its tolerance,
-// in hundredths; 127: farther, beside the patch, or not in question, which are those that are no corner of the fragment's
+// A byte for each corner of the cells in the fragment's rectangle: the root of the distance along the patch's axis over its
+// tolerance, in hundredths; 127: farther, beside the patch, or not in question, which are those that are no corner of the fragment's
 // cells, and every other one, as on a chess board. The highest bit: the patch goes on by `reach` nodes on all sides.
 //
 // pairs: patch, image, first row, first column, rows, columns, label. images: first sample, columns, sign.
@@ -42,7 +42,7 @@ __kernel void range_distances(int count, float reach, __global const float *plac
           float s = u - (float)i, t = v - (float)j;
           __global const float *c = h + j * M + i;
           float there = (1.0f - t) * ((1.0f - s) * c[0] + s * c[1]) + t * ((1.0f - s) * c[M] + s * c[M + 1]);
-          float distance = 100.0f * fabs(d - there) / place.tolerance;
+          float distance = 100.0f * sqrt(fabs(d - there) / place.tolerance);
           if (distance <= 100.0f) {
             code = (int)ceil(distance);
             if (drawn(h, u - reach, v - reach) && drawn(h, u + reach, v - reach) && drawn(h, u - reach, v + reach)
