@@ -13,6 +13,7 @@ from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .frame import Frame
 from .patch_drawing import PatchDrawing
+from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
 from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
@@ -49,6 +50,7 @@ class Renderer:
         lanes = self.device.lanes if lanes is None else lanes
         if lanes not in (16, 8, 4, 1):
             raise InputError(f"lanes: expected 16, 8, 4 or 1, got {lanes}")
+        self._tile_given = tile is not None
         tile = (BIN if lanes == 1 else 32) if tile is None else tile
         if tile != int(tile) or tile <= 0 or tile % BIN:
             raise InputError(f"tile: expected a positive multiple of {BIN} pixels, got {tile}")
@@ -156,12 +158,13 @@ class Renderer:
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
+        patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
         if not planes:
-            return Grid(size, self.tile_bins, layout, None, None)
+            return Grid(size, self.tile_bins, layout, None, None, patch_bins)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
         return Grid(size, self.tile_bins, layout, touched,
-                    self._scratch.array("planes", (bins, fields, 64), np.float32))
+                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins)
 
     def _uploaded(self, surface):
         upload = self._uploads.get(surface)

@@ -46,6 +46,7 @@ class Grid:
     layout: Layout
     touched: DeviceArray | None  # (bins,) int32: pixel evaluations of the tile stages, -1 where nothing came
     planes: DeviceArray | None  # (bins, FIELDS, 64) float32; None where the picture is shaded without them
+    patch_bins: int = 4  # bins across a tile of patches
 
     @property
     def bins_x(self) -> int:

@@ -449,7 +449,7 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
     VI i = within - j * m;
     VI low = i < 0, high = i >= (VI)(m);  // the division was rounded
     j = SEL(SEL(j, j - 1, low), j + 1, high); i = within - j * m;
-    VF fi = TO_VF(i), fj = TO_VF(j), x, y, z, w, depth, gx, gy, red = zero, green = zero, blue = zero;
+    VF fi = TO_VF(i), fj = TO_VF(j), x, y, z, w, depth = zero, gx, gy, red = zero, green = zero, blue = zero;
     VU a[4];
     GATHERED(a, nodes.nodes, at)
     if (flags & PATCH_DIRECT) {
@@ -463,11 +463,7 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
       GATHERED(b, nodes.nodes, next)
       GATHERED(c, nodes.nodes, above)
       GATHERED(d, nodes.nodes, across)
-      VF bx, by, bz, bw, cx, cy, cz, cw, dx, dy, dz, dw, s, t;
-      project_nodes(h, perspective, fi, fj, AS_VF(a[0]), &x, &y, &z, &w);
-      project_nodes(h, perspective, fi + 1.0f, fj, AS_VF(b[0]), &bx, &by, &bz, &bw);
-      project_nodes(h, perspective, fi, fj + 1.0f, AS_VF(c[0]), &cx, &cy, &cz, &cw);
-      project_nodes(h, perspective, fi + 1.0f, fj + 1.0f, AS_VF(d[0]), &dx, &dy, &dz, &dw);
+      VF s = zero, t = zero;
 #if LATTICE || SMOOTH_NORMALS
       Heights cell;
 #define CORNER(k, n, node) cell.d[k] = AS_VF(n[0]); cell.gx[k] = SLOPE_X(n) * h[SLOPE_SCALE]; \
@@ -479,8 +475,24 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
 #if LATTICE
       depth = seen_place(&cell, h, perspective, fi, fj, px, py, &s, &t);
 #else
-      place_in_cell(x - px * w, y - py * w, bx - px * bw, by - py * bw, cx - px * cw, cy - py * cw, dx - px * dw,
-                    dy - py * dw, z, bz, cz, dz, view[NEAR], &s, &t, &depth);
+      VI hard = mine;
+#if !TRIANGLES && !NODES
+      VF e;
+      hard = mine & NOT(place_on_ray(h, perspective, px, py, fi, fj, AS_VF(a[0]), AS_VF(b[0]), AS_VF(c[0]), AS_VF(d[0]),
+                                     &s, &t, &e));
+      depth = h[HZ] + (fi + s) * h[HZ + 1] + (fj + t) * h[HZ + 2] + (AS_VF(a[0]) + e) * h[HZ + 3];
+#endif
+      if (flags & PATCH_CLIPPED) hard = mine;
+      if (any_lane(hard)) {
+        VF bx, by, bz, bw, cx, cy, cz, cw, dx, dy, dz, dw, u, v, deep;
+        project_nodes(h, perspective, fi, fj, AS_VF(a[0]), &x, &y, &z, &w);
+        project_nodes(h, perspective, fi + 1.0f, fj, AS_VF(b[0]), &bx, &by, &bz, &bw);
+        project_nodes(h, perspective, fi, fj + 1.0f, AS_VF(c[0]), &cx, &cy, &cz, &cw);
+        project_nodes(h, perspective, fi + 1.0f, fj + 1.0f, AS_VF(d[0]), &dx, &dy, &dz, &dw);
+        place_in_cell(x - px * w, y - py * w, bx - px * bw, by - py * bw, cx - px * cw, cy - py * cw, dx - px * dw,
+                      dy - py * dw, z, bz, cz, dz, view[NEAR], &u, &v, &deep);
+        s = SEL(s, u, hard); t = SEL(t, v, hard); depth = SEL(depth, deep, hard);
+      }
 #endif
       // Weights of the corners; the depth of two triangles is not bilinear.
       VF wd = s * t, wb = s - wd, wc = t - wd, wa = 1.0f - s - wc;
