@@ -2,6 +2,7 @@
 
 import importlib
 from dataclasses import dataclass
+from os import PathLike
 
 import numpy as np
 
@@ -97,9 +98,10 @@ def _fitting(scan, method):
 
 def _loaded(path):
     from ..io import load
-    scan = load(path)
+    scan = load(path) if isinstance(path, str | PathLike) else path
     if not isinstance(scan, Mesh | PointCloud) and not hasattr(scan, "images"):
-        raise InputError(f"scan: expected a mesh, a point cloud or range images, got a {type(scan).__name__}")
+        raise InputError("scan: expected a Mesh, a PointCloud, a RangeScan or the path of a scan, got "
+                         f"{type(scan).__name__}")
     return scan
 
 
