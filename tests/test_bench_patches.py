@@ -95,7 +95,9 @@ def test_the_job_runs(device, monkeypatch, tmp_path):
     monkeypatch.setattr(scenes, "data_folder", lambda: tmp_path)
     result = bench.run("patches", device, tmp_path / "figures.json", quick=True, profile=True)["figures"]
     assert set(result["models"]) == {"sphere", "earth 383"} and result["models"]["sphere"]["nbytes"] == 448_098
-    assert result["pictures"]["sphere"]["pinholes"] == 0 and result["pictures"]["sphere"]["radial"] < 0.01
+    found = result["pictures"]
+    assert found["sphere"]["radial"] < 0.01 and found["sphere"]["off_facing"] == found["sphere"]["outside"] == 0
+    assert found["sphere"]["pinholes"] == found["earth 383"]["pinholes"] == found["earth 383"]["depth_speckle"] == 0
     assert all(figures["frame"]["median_s"] > 0 for figures in result["frames"].values())
     assert result["modes"]["quads"]["ratio"] == 1
     assert result["stages"]

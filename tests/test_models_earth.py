@@ -179,3 +179,6 @@ def test_damaged_elevations(tmp_path):
     (tmp_path / "heights.gz").write_bytes(b"no gzip")
     with pytest.raises(FileFormatError, match="numbers"):
         models.earth(elevation=tmp_path / "heights.gz")
+    (tmp_path / "heights.npy").write_bytes(b"no array")
+    with pytest.raises(FileFormatError, match="array of heights"):
+        models.earth(elevation=tmp_path / "heights.npy")

@@ -230,7 +230,10 @@ def _read_elevation(path: Path):
     """Return what `_elevation_map` takes from a picture, a .npy file, or a (gzipped) text grid."""
     ending = path.suffix.lower()
     if ending == ".npy":
-        return np.load(path, allow_pickle=False)
+        try:
+            return np.load(path, allow_pickle=False)
+        except (OSError, EOFError, ValueError) as error:
+            raise FileFormatError(f"{path}: expected an array of heights, got {error}") from None
     if ending not in (".gz", ".txt", ".asc", ".csv"):
         return read_image(path)[..., 0]
     heights = _read_numbers(path)
