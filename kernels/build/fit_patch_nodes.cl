@@ -36,7 +36,7 @@ typedef union { float16 v; float s[16]; } Sixteen;
 
 // Points of a block in the patch's frame, relative to the tile.
 typedef struct {
-  Sixteen u, v, w, slope_u, slope_v, facing;
+  Sixteen u, v, w, slope_u, slope_v;
   int16 usable;
 } Block;
 
@@ -54,7 +54,7 @@ inline void load_block(Block *b, __global const float *sorted, int padded, uint 
   b->u.v = dx * t->x.x + dy * t->x.y + dz * t->x.z;
   b->v.v = dx * t->y.x + dy * t->y.y + dz * t->y.z;
   b->w.v = dx * t->z.x + dy * t->z.y + dz * t->z.z;
-  float16 facing = b->facing.v = nx * t->z.x + ny * t->z.y + nz * t->z.z;
+  float16 facing = nx * t->z.x + ny * t->z.y + nz * t->z.z;
   b->usable = (facing > FACING) & (b->u.v >= t->low_u) & (b->u.v <= t->high_u) & (b->v.v >= t->low_v) &
               (b->v.v <= t->high_v);
   float16 inverse = -1.0f / SEL((float16)1.0f, facing, facing > FACING);
@@ -102,7 +102,7 @@ __kernel void fit_patch_nodes(int patches, int columns, int rows, int tiles_x, i
 
   VI i = LANE_INDEX % TILE_W, j = LANE_INDEX / TILE_W;
   VF u = TO_VF(i) * spacing, v = TO_VF(j) * spacing;
-  float inverse2 = 1.0f / (reach * reach);
+  float inverse2 = 1.0f / (reach * reach), need = spacing + widen;
   VF total = 0.0f, h = 0.0f, su = 0.0f, sv = 0.0f;
   VI needed = 0;
   uint list[BLOCK_LIST];
@@ -131,7 +131,6 @@ __kernel void fit_patch_nodes(int patches, int columns, int rows, int tiles_x, i
         su += g * b.slope_u.s[p];
         sv += g * b.slope_v.s[p];
         if (!own.s[p]) continue;
-        float need = spacing + widen * (b.facing.s[p] > 0.7f ? b.facing.s[p] : 0.7f); // slopes are longer than they look
         needed |= (du <= need) & (du >= -need) & (dv <= need) & (dv >= -need);
       }
     }

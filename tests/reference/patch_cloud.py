@@ -54,9 +54,8 @@ def fit_patch_nodes(points, normals, regions, light, frame, patch, columns, rows
         for i in range(columns):
             du, dv = u - i * spacing, v - j * spacing
             weight = np.clip(1 - (du**2 + dv**2) / reach**2, 0, None) ** 4
-            need = spacing + widen * np.maximum(facing, 0.7)
             g = weight * near_own
-            if not (own & (np.maximum(np.abs(du), np.abs(dv)) <= need)).any() or g.sum() == 0:
+            if not (own & (np.maximum(np.abs(du), np.abs(dv)) <= spacing + widen)).any() or g.sum() == 0:
                 continue
             h = (g * (w - slope_u * du - slope_v * dv))[near_own].sum() / g.sum()
             su, sv = (g * slope_u)[near_own].sum() / g.sum(), (g * slope_v)[near_own].sum() / g.sum()
