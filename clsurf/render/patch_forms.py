@@ -1,6 +1,6 @@
 """The forms of a surface that modes draw: with coarser levels for minification, with nodes carried on for alpha.
 
-A form is uploaded when the first frame needs it. Kernels: kernels/render/*_levels.cl, pack_alphas.cl.
+A form is uploaded when the first frame needs it. Kernels: kernels/render/*_levels.cl, pack_alphas.cl, cull_patches.cl.
 """
 
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
-from ..surface.patch import PatchSurface
+from ..surface.patch import PatchSurface, facet_cones
 from .patch_alpha import extended
 from .patch_mips import with_levels
 from .tiles import Scratch
@@ -90,3 +90,24 @@ def select_levels(device: Device, scratch: Scratch, form: Form, view: DeviceArra
 def mark_levels(device: Device, records: DeviceArray, levels: DeviceArray, count: int) -> None:
     """Write the levels into the flags of projected patches."""
     device.kernel("render/mark_levels.cl")((count,), (16,), records, records.shape[1], levels, count)
+
+
+def cull_patches(device: Device, upload, whole, levels_count: int, levels: DeviceArray | None, view: DeviceArray,
+                 projected) -> None:
+    """Mark the patches that are seen from behind only as not in the picture; surfaces without orientation keep all.
+
+    `whole` is the upload whose surface's patches are `upload`'s levels; the same where there is one level.
+    """
+    cones = whole.once("cones", lambda surface: _cones(device, surface))
+    if cones is not None and upload.count:
+        device.kernel("render/cull_patches.cl")(
+            (upload.count,), (16,), view, upload.frames, upload.sizes, upload.count, cones, levels_count,
+            upload.sizes if levels is None else levels, projected.rectangles, projected.boxes)
+
+
+def _cones(device, surface):
+    """Return the cones (p, 4) float32 of the facet normals, axis and half angle, or None."""
+    if not surface.oriented:
+        return None
+    axes, cosines = facet_cones(surface)
+    return device.upload(np.concatenate([axes, np.arccos(np.clip(cosines, -1, 1))[:, None]], axis=1), np.float32)

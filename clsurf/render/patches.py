@@ -13,7 +13,7 @@ from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
 from .patch_drawing import PatchDrawing
-from .patch_forms import mark_levels, select_levels, surface_form
+from .patch_forms import cull_patches, mark_levels, select_levels, surface_form
 from .patch_lattice import CELLS
 from .patch_nodes import LIT_UNIT, light_nodes, table_normals
 from .patch_tiles import NODES, PAD, tile_patches
@@ -183,13 +183,14 @@ def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, ou
     """Run the stages of one surface: project, work at the nodes where a mode asks for it, tile."""
     drawing, levels = look.patches, None
     form = surface_form(device, upload, upload_patches, floats, drawing)
-    if form is not None:
-        upload, levels = form.upload, None
-        if form.levels > 1:
-            upload, levels = select_levels(device, scratch, form, view)
+    whole = upload = upload if form is None else form.upload
+    if form is not None and form.levels > 1:
+        upload, levels = select_levels(device, scratch, form, view)
     projected = project_patches(device, scratch, upload, view, drawing)
     if levels is not None:
         mark_levels(device, projected.records, levels, upload.count)
+    if drawing.cull and drawing.cells != "smooth":  # the cones hold the normals of facets
+        cull_patches(device, upload, whole, 1 if levels is None else form.levels, levels, view, projected)
     constants = patch_constants(upload)
     if drawing.normal_table:
         nodes, _ = table_normals(device, scratch, upload, constants, projected.rectangles, drawing.normal_table)
