@@ -3,6 +3,8 @@
 Paper on spatial patches, section 4.4 and figure 8: "detection of the sharp edges and generation of small patches that
 have intermediate orientation with respect to the faces adjacent in the selected edges ... of higher resolution". One
 row of their nodes lies on the edge, and the patches of the two faces end before it: nothing stands out over it.
+Fandisk, 600 patches (211 of them strips), 500x500, mean of 8 views: 1,198 pixels outside the silhouette without strips,
+8 with them, none by more than a pixel; no hole.
 """
 
 import numpy as np

@@ -37,7 +37,7 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     nodes : int or (int, int)
         Nodes of a patch along its two axes, 2 to 256.
     patches : int, optional
-        Number of patches.
+        Number of patches, those along the sharp edges of meshes included; with `spacing` these come in addition.
     spacing : float, optional
         Distance between nodes, world units.
     error : float, optional

@@ -1,11 +1,11 @@
 // Heights of a triangle mesh over the nodes of patches, one work-item a patch.
 //
-// A patch owns the first faces of its list; the rest lie around them. A node is needed where an own face meets one of the
-// four cells around it, or comes within REACH - 1 steps of them. Its height is that of the own face above it, the highest
-// of several; beyond the own faces that of the face around which lies closest to the plane of the nearest own face, if it
-// is within GAP_LIMIT steps of it. Where there is none (at open borders and folds) the plane is carried on, but only to
-// nodes within CARRY steps of an own face, and never over an edge between two vertices that `cut` marks: patches of
-// its own follow that. Scratch: two floats a node.
+// A patch owns the first faces of its list; the rest lie around them. A node is needed where an own face meets one of
+// the four cells around it, or comes within REACH - 1 steps of them. Its height is that of the own face above it, the
+// highest of several; beyond the own faces that of the face around which lies closest to the plane of the nearest own
+// face, if it is within GAP_LIMIT steps of it. Where there is none (at open borders and folds) the plane is carried on,
+// but only to nodes within CARRY steps of an own face, and never over an edge between two vertices that `cut` marks:
+// patches of its own follow that. Scratch: two floats a node.
 //
 // Paper on spatial patches, section 4.1 ("can be converted to patches, since ... projected onto a plane").
 #include "build/patch_frame.clh"
@@ -128,7 +128,8 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
   }
   for (int k = first; k < first + m * n; k++) {
     if (source[k] <= CUT) gap[k] = LOOSE;
-    heights[k] = gap[k] == LOOSE ? NAN : frame[FRAME_STEP] * (gap[k] >= 0.0f && gap[k] < CARRIED ? distance[k] : heights[k]);
+    float z = gap[k] >= 0.0f && gap[k] < CARRIED ? distance[k] : heights[k];
+    heights[k] = gap[k] == LOOSE ? NAN : frame[FRAME_STEP] * z;
     if (gap[k] == LOOSE) source[k] = -1;
   }
 }
