@@ -93,6 +93,19 @@ def test_range_cells(device, scan, field):
         assert not cells[:, 17].any(), "the step at column 18 is cut"
 
 
+@pytest.mark.parametrize("squared", [False, True])
+def test_range_cells_of_a_noisy_sensor(device, scan, field, squared):
+    """Noise of half the step, as it is and over the squared distance: only then the step is no jump."""
+    noise = 0.13 if squared else 0.3
+    cells = device.zeros(field.cells.shape, np.uint8)
+    device.kernel("build/range_cells.cl")((SHAPE[1], SHAPE[0]), (16, 1), *SHAPE, 0, *field.eyes[0], 5.0, noise, 0.0,
+                                          int(squared), field.samples, cells)
+    points, _, _ = host(field, device, 0)
+    expected = twin.range_cells(points, field.eyes[0], 5.0, noise, 0, squared)
+    assert (device.download(cells)[:expected.size].reshape(SHAPE) == expected).all()
+    assert expected[:, 17].any() == squared
+
+
 def test_range_cells_of_points(device):
     image = wavy_image()
     points = image.sensor_points()[..., [0, 1, 2]] * np.float32([1, 1, -1])
