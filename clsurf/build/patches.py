@@ -74,6 +74,8 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     method = _method_of(scan) if method is None else method
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    if views is not None and method != "global_views":
+        raise InputError(f"views: expected with method global_views only, got {method}")
     scan = _fitting(scan, method)
     module = importlib.import_module(f"{__package__}.{METHODS[method]}")
     return module.convert(scan, request, open_device(device), _step(progress))

@@ -16,7 +16,8 @@ LodOption = Annotated[float, typer.Option(help="slim: projected diameter in pixe
                                           "8 is the fast mode, 0 draws leaves only.")]
 NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, exact, trilinear or homogeneous.")]
 CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
-AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes up to half their alpha.")]
+AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, up to half "
+                                           "their alpha.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
 LookOption = Annotated[str, typer.Option(help="phong, flat; slim: ball_size, ball_level.")]
 

@@ -80,7 +80,7 @@ def save(thing, path) -> None:
         scans.save_scan(thing, path)
     else:
         allowed = ((*scans.WRITES, ".clsurf") if isinstance(thing, Mesh | PointCloud) else
-                   (".clsurf",) if isinstance(thing, RangeScan) else SURFACES)
+                   SURFACES if isinstance(thing, SlimSurface) else (".clsurf",))
         raise InputError(f"{path}: a {type(thing).__name__} cannot be written as {ending or '(no ending)'}: expected "
                          f"one of {' '.join(allowed)}")
 
