@@ -209,7 +209,7 @@ class Merging:
             if not len(mutual):
                 return
             spare = self.count - target
-            most = max(1, spare // 3) if self.count < 4 * target else spare
+            most = max(1, spare // 2) if self.count < 4 * target else spare
             if len(mutual) > most:
                 mutual = mutual[np.argsort(cost[mutual], kind="stable")[:most]]
             self._apply(self._fitting(mutual, width[mutual]))
