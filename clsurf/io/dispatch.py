@@ -5,7 +5,6 @@ from pathlib import Path
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
-from clsurf.surface.ranges import RangeScan
 from clsurf.surface.slim import SlimSurface
 
 from . import scans
