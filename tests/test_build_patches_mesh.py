@@ -195,7 +195,8 @@ def test_an_error_is_met(device):
     fine = build_patches(mesh, error=3e-4, device=device)
     assert coarse.node_count < fine.node_count
     for surface, error in ((coarse, 1e-3), (fine, 3e-4)):
-        assert quality(surface, mesh, 3_000, parts=1)["rms_mesh"] <= 101 * error
+        # other points of the faces than the search's: 1 % noise of the samples, 1-2 % between the two measures
+        assert quality(surface, mesh, 10_000, parts=1)["rms_mesh"] <= 104 * error
 
 
 def test_patch_distances(device):
