@@ -13,14 +13,16 @@ from clsurf.build.quantize import quantized
 from clsurf.errors import InputError
 from clsurf.render.camera import Camera
 from clsurf.render.normal_table import half_steps, normal_statistics, ratio_groups
+from clsurf.render.patch_alpha import extended
 from clsurf.render.patch_drawing import PatchDrawing
+from clsurf.render.patch_forms import cull_patches
 from clsurf.render.patch_mips import halved, mip_levels, tent
 from clsurf.render.patch_nodes import LIT_RANGE, light_nodes, table_normals
 from clsurf.render.patches import patch_constants, place_patches, project_patches, upload_patches
 from clsurf.render.renderer import Renderer
 from clsurf.render.scene import Scene
 from clsurf.render.shade import Light, Shading, shading_floats, to_linear
-from clsurf.render.tiles import Scratch
+from clsurf.render.tiles import Scratch, view_floats
 from clsurf.surface.patch import PatchSurface
 
 # Patches to draw ------------------------------------------------------------------------------------------------------
@@ -401,3 +403,157 @@ def test_the_table_wants_what_it_can_hold(renderers):
         renderers[0].render(rough(4), None, SIZE, patches=PatchDrawing(normal_table="precomputed"))
     with pytest.raises(InputError, match="8-bit"):
         renderers[0].render(sheet(wavy)[0], None, SIZE, patches=PatchDrawing(normal_table=True))
+
+
+# Alpha ----------------------------------------------------------------------------------------------------------------
+
+
+def disc(nodes, radius=0.9, colors=None, tilt=0.2):
+    """A tilted disc in one patch of side 2.2; nodes outside are transparent."""
+    spacing = 2.2 / (nodes - 1)
+    return sheet(lambda x, y: np.where(np.hypot(x, y) <= radius, tilt * x, np.nan), (nodes, nodes), spacing,
+                 colors=colors)[0]
+
+
+def test_carried_on_nodes_continue_a_plane():
+    for colors in (None, np.full((81, 3), 90), np.full((81, 4), 90)):
+        surface = disc(9, colors=colors)
+        around, alphas = extended(surface)
+        p = around.positions()
+        new = around.opaque & ~surface.opaque
+        assert new.sum() > 15 and np.abs(p[new, 2] - 0.2 * p[new, 0]).max() < 3e-6
+        assert (around.opaque[surface.opaque]).all() and (alphas[~surface.opaque] == 0).all()
+        assert (alphas[surface.opaque] == (90 if np.ndim(colors) and colors.shape[1] == 4 else 255)).all()
+    assert not extended(rough(2, holes=1.0))[0].opaque.any()
+    mixed = joined(rough(2), rough(1, (4, 11)))
+    assert np.array_equal(extended(mixed)[0].displacements[:126], extended(rough(2))[0].displacements)
+
+
+@pytest.mark.parametrize("cells", ["quads", "triangles", "bilinear", "smooth"])
+def test_alpha_makes_rims_rounder(renderers, cells):
+    """A disc's area is off by a fifth of what skipping half-transparent cells costs; the same in both forms."""
+    camera = Camera.orthographic((0, 0, 5), (0, 0, 0), height=2.2)
+    error = {}
+    for alpha in (False, True):
+        drawing = PatchDrawing(cells=cells, alpha=alpha, direct=False)
+        frames = [[r.render(disc(nodes), camera, (220, 220), ("depth",), patches=drawing) for r in renderers[:2]]
+                  for nodes in (17, 33, 65)]
+        assert all(np.array_equal(a.depth, b.depth, equal_nan=True) for a, b in frames)
+        error[alpha] = [abs(np.isfinite(a.depth).mean() * 2.2 ** 2 / (np.pi * 0.81) - 1) for a, _ in frames]
+    assert sum(error[True]) < 0.2 * sum(error[False]) and error[True][-1] < 0.015
+
+
+def test_alpha_of_nodes_gives_the_circle(renderers):
+    """Nodes that carry the coverage of a circle put the edge where it is: of second order, and round."""
+    camera, error = Camera.orthographic((0, 0, 5), (0, 0, 0), height=2.2), []
+    for nodes in (17, 33):
+        spacing = 2.2 / (nodes - 1)
+        at = (np.arange(nodes) * spacing) - 1.1
+        inside = np.clip(0.5 + (0.9 - np.hypot(at[None], at[:, None])) / (2 * spacing), 0, 1)
+        colors = np.full((nodes ** 2, 4), 200)
+        colors[:, 3] = np.rint(255 * inside.ravel())
+        surface = sheet(lambda x, y: 0 * x, (nodes, nodes), spacing, colors=colors)[0]
+        frame = renderers[0].render(surface, camera, (220, 220), ("depth", "position"),
+                                    patches=PatchDrawing(alpha=True))
+        shown = np.isfinite(frame.depth)
+        rim = shown & ~ndimage.binary_erosion(shown)
+        radius = np.hypot(frame.position[rim, 0], frame.position[rim, 1])
+        error.append(np.abs(radius - 0.9 + 0.005).max())
+    assert error[0] < 0.03 and error[1] < 0.015
+
+
+def test_alpha_with_supersampling_gives_smooth_edges(renderers):
+    frame = renderers[0].render(disc(33), Camera.orthographic((0, 0, 5), (0, 0, 0), height=2.2), (60, 60), ("color",),
+                                background=(0, 0, 0, 0), supersampling=4, patches=PatchDrawing(alpha=True))
+    cover = frame.color[..., 3]
+    assert ((cover > 0.1) & (cover < 0.9)).sum() > 60
+    assert abs(cover.mean() * 2.2 ** 2 / (np.pi * 0.81) - 1) < 0.02
+
+
+# Minification and back faces ------------------------------------------------------------------------------------------
+
+
+def globe(count=60, bump=0.0, checks=0):
+    """A bumpy unit sphere of 17 x 17 patches, with a fine chequer of colours."""
+    k = np.arange(count) + 0.5
+    z, angle = 1 - 2 * k / count, np.pi * (1 + 5 ** 0.5) * k
+    normal = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+    x = np.cross(np.where(np.abs(normal[:, 2:]) < 0.9, [[0, 0, 1.0]], [[1.0, 0, 0]]), normal)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    y, step = np.cross(normal, x), 1.6 * np.sqrt(4 * np.pi / count) / 16
+    u, v = (np.tile(np.arange(17), 17) - 8) * step, (np.repeat(np.arange(17), 17) - 8) * step
+    height = np.sqrt(1 - u * u - v * v) - 1 + 0 * k[:, None]
+    p = normal[:, None] * (1 + height[..., None]) + u[:, None] * x[:, None] + v[:, None] * y[:, None]
+    height = height + bump * np.sin(9 * p[..., 0]) * np.sin(8 * p[..., 1])
+    check = np.floor(p * checks).sum(axis=2) % 2 if checks else np.zeros(p.shape[:2])
+    colors = np.repeat((255 - 250 * check).reshape(-1, 1), 3, axis=1)
+    return quantized(normal - 8 * step * (x + y), x * step, y * step, height.ravel(), (17, 17), colors)
+
+
+@pytest.mark.parametrize("distance", [4.0, 12.0, 40.0, 150.0])
+def test_select_levels(renderers, distance):
+    """The channel "level" says the levels that the twin chooses, and both forms draw the same."""
+    surface = globe()
+    camera = Camera.look_at((0, distance * 0.6, distance * 0.8), (0.3, 0, 0), fov=40)
+    a, b, c = (r.render(surface, camera, SIZE, ("color", "depth", "level")) for r in renderers)
+    for other in (b, c):
+        assert all(np.array_equal(a.channels[n], other.channels[n], equal_nan=n != "level") for n in a.channels)
+    view = view_floats(camera, SIZE, camera.rotation, camera.rotation @ (surface.origin - camera.eye))
+    wanted = twin.select_levels(view, mip_levels(surface))
+    shown = a.level[np.isfinite(a.depth)]
+    assert set(np.unique(shown)) <= set(wanted) and len(shown) > 0
+    assert abs(np.median(shown) - np.median(wanted)) <= 1
+    plain = renderers[0].render(surface, camera, SIZE, ("level",), patches=PatchDrawing(mip=False))
+    assert set(np.unique(plain.level)) <= {-1, 0}
+
+
+def test_levels_leave_no_cracks(renderers):
+    """Patches of different levels beside each other still cover the sphere, and lie on it."""
+    surface = globe(120)
+    for distance in (9.0, 12.0, 16.0, 24.0):
+        camera = Camera.look_at((0, 0, distance), (0, 0, 0), fov=30)
+        frame = renderers[0].render(surface, camera, (90, 90), ("depth", "level"))
+        shown = np.isfinite(frame.depth)
+        assert (ndimage.binary_fill_holes(shown) == shown).all()
+    levels = set(np.unique(frame.level)) - {-1}
+    assert max(levels) >= 1
+
+
+def test_levels_alias_less(renderers):
+    """Against a picture of 16 x 16 samples a pixel, a far chequered sphere is at least a third closer with levels."""
+    surface = globe(60, checks=40)
+    for distance in (20.0, 45.0):
+        camera = Camera.look_at((0, 0.5 * distance, distance), (0, 0, 0), fov=20)
+        fine = renderers[0].render(surface, camera, (160 * 4, 160 * 4), ("color",), "flat", supersampling=4,
+                                   patches=PatchDrawing(mip=False)).color
+        wanted = fine.reshape(40, 16, 40, 16, 4).mean(axis=(1, 3))
+        error = [np.sqrt(np.mean((renderers[0].render(surface, camera, (40, 40), ("color",), "flat",
+                                                      patches=PatchDrawing(mip=m)).color - wanted) ** 2))
+                 for m in (True, False)]
+        assert error[0] < 0.67 * error[1]
+
+
+@pytest.mark.parametrize("camera", [Camera.look_at((0, 2, 3), (0, 0, 0)),
+                                    Camera.look_at((0, 0.3, 1.4), (0, 0, 0), fov=90),
+                                    Camera.look_at((0, 20, 30), (0, 0, 0), fov=8),
+                                    Camera.orthographic((1, 2, 3), (0, 0, 0), height=2.3)])
+@pytest.mark.parametrize("bump", [0.0, 0.05])
+def test_cull_patches(device, camera, bump):
+    """Only patches that show nothing but backs are left out, most of those are, and a closed surface looks the same."""
+    surface = globe(60, bump)
+    with Renderer(device) as r:
+        frames = [r.render(surface, camera, SIZE, ("depth", "normal"), patches=PatchDrawing(cull=cull, mip=False))
+                  for cull in (False, True)]
+    for name, array in frames[0].channels.items():
+        assert np.array_equal(array, frames[1].channels[name], equal_nan=True)
+    upload, scratch = upload_patches(device, surface), Scratch(device, 16)
+    view = device.upload(place_patches(upload, None, camera, SIZE, Shading()))
+    projected = project_patches(device, scratch, upload, view, PatchDrawing())
+    before = device.download(projected.rectangles)
+    cull_patches(device, upload, upload, 1, None, view, projected)
+    after = device.download(projected.rectangles)
+    removed = (before[:, 0] <= before[:, 2]) & (after[:, 0] > after[:, 2])
+    if camera.fov is not None:
+        behind = twin.seen_from_behind(surface, camera.eye)
+        assert behind[removed].all() and removed.sum() > 0.3 * (behind & (before[:, 0] <= before[:, 2])).sum()
+    assert removed.sum() > 5

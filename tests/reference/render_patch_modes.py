@@ -140,3 +140,32 @@ def light_nodes(view, shading, surface, k, linear):
     w = depth if v.perspective else 1.0
     pixels = np.stack([v.cx + v.fx * p[:, 0] / w, v.cy - v.fy * p[:, 1] / w], axis=1)
     return shade(view, shading, pixels, depth, normal, linear)[:, :3]
+
+
+def select_levels(view, levels):
+    """The level (p,) of every patch: the coarsest whose nodes are at most a pixel apart at its nearest corner."""
+    v = opened(view)
+    p = (levels[0].boxes() - levels[0].origin).reshape(-1, 3) @ v.rotation.T * v.scale + v.offset
+    near = -p[:, 2].reshape(-1, 8).max(axis=1)
+    px = v.scale * max(v.fx, v.fy) / (near if v.perspective else 1.0)
+    out = np.zeros(len(levels[0]), int)
+    for number, level in enumerate(levels):
+        step = np.maximum(*(np.linalg.norm(a, axis=1) for a in (level.axis_x, level.axis_y)))
+        out[(px * step <= 1) & ((near > 0) | ~v.perspective)] = number
+    return out
+
+
+def seen_from_behind(surface, eye):
+    """Patches (p,) all of whose facets face away from `eye` (world)."""
+    out = np.ones(len(surface), bool)
+    points = surface.positions()
+    for k in range(len(surface)):
+        m, n = surface.size[k]
+        p = points[surface.node_offset[k]:surface.node_offset[k + 1]].reshape(n, m, 3)
+        for j in range(n - 1):
+            for i in range(m - 1):
+                a, b, c, d = p[j, i], p[j, i + 1], p[j + 1, i], p[j + 1, i + 1]
+                if np.isfinite([a, b, c, d]).all():
+                    for at, x, y in ((a, b - a, c - a), (b, b - a, d - b), (c, d - c, c - a), (d, d - c, d - b)):
+                        out[k] &= np.cross(x, y) @ (eye - at) < 0
+    return out
