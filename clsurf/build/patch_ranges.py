@@ -29,6 +29,9 @@ REACH = 4  # cells around its fragment that a patch of a single image looks at
 TOLERANCE = 2.0
 NOISE_TOLERANCE = 3.0  # the same over the sensor's noise
 INSIDE = 0.6  # nodes by which a patch goes on around a sample that counts as covered by it
+# Share of a patch's samples that may be lost with it. 0, 1, 3 %: 4529, 4104, 3526 patches of the happy scans, 119, 146 and
+# 187 pixels of pinholes in three views; coverage 99.92 % with each.
+LOST = 0.01
 BATCH = 2048  # patches resampled at once
 BOUND_SHARE = 0.99  # of the samples within the tolerance of a patch: the share of them that the bound is given for
 LEAST_NODES = 4  # a patch whose nodes all lie on the border of its fragment would have none on it
@@ -242,7 +245,7 @@ def needed(field: RangeField, fragments: Fragments, places: Places, pairs: NDArr
            device: Device) -> NDArray:
     """Return which patches (p,) bool stay.
 
-    One after the other, the worst seen first, a patch goes if the others cover all that it covers.
+    One after the other, the worst seen first, a patch goes if the others cover (nearly) all that it covers.
 
     A sample is covered by a patch that goes on around it, within the tolerance of it; at borders, where no patch does,
     by one that holds it at all.
@@ -261,7 +264,7 @@ def needed(field: RangeField, fragments: Fragments, places: Places, pairs: NDArr
     keep = np.diff(first) > 0
     for p in np.argsort(fragments.weight, kind="stable"):
         own = sample[first[p]:first[p + 1]]
-        if keep[p] and (covered[own] > 1).all():
+        if keep[p] and (covered[own] == 1).sum() <= LOST * len(own):
             keep[p] = False
             covered[own] -= 1
     return keep
