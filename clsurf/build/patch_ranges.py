@@ -29,7 +29,7 @@ REACH = 4  # cells around its fragment that a patch of a single image looks at
 TOLERANCE = 2.0
 NOISE_TOLERANCE = 3.0  # the same over the sensor's noise
 INSIDE = 0.6  # nodes by which a patch goes on around a sample that counts as covered by it
-# Share of a patch's samples that may be lost with it. 0, 1, 3 %: 4529, 4104, 3526 patches of the happy scans, 119, 146 and
+# Share of a patch's samples that may be lost with it. 0, 1, 3 %: 4529, 4104, 3526 patches of the happy scans; 119, 146,
 # 187 pixels of pinholes in three views; coverage 99.92 % with each.
 LOST = 0.01
 BATCH = 2048  # patches resampled at once
