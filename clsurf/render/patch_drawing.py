@@ -19,21 +19,25 @@ class PatchDrawing:
         Projection of nodes: "exact"; "trilinear" from the projected corners of the patch's box, the paper's;
         "homogeneous", the same before the division, which is exact.
     cells : str
-        What fills a cell: "quads", two "triangles", or subdivided points, "bilinear" or "smooth".
+        What fills a cell: "quads", two "triangles", or points less than a pixel apart that subdivide it, "bilinear" or
+        "smooth" (C1 over the patch; it passes through the nodes). Points widen outlines by up to half a pixel.
     shading : str
-        Light per "pixel", or at the nodes ("gouraud").
+        Light per "pixel", or at the nodes ("gouraud"), with colours interpolated.
     normals : str
-        Interpolation of normals, "bilinear" or "smooth".
+        Interpolation of the nodes' normals: "bilinear", or "smooth", those of the C1 surface.
     normal_table : bool or str
-        Take normals from a table of 512 KB; True, "ordered" or "precomputed".
+        Take the nodes' normals from a table of 512 KB per compute unit: True, with the patches as they come; "ordered"
+        by axis ratios; "precomputed", for patches of equal ratios. For 8-bit displacements; draws no coarser levels.
+        Slower than computing them (1.35 times a frame, ordered 1.15).
     alpha : bool
-        Draw cells with transparent nodes, their edge at half alpha.
+        Draw cells with transparent nodes up to where their interpolated alpha is 1/2; an RGBA node has its own. Smooth
+        edges come from supersampling.
     direct : bool
-        Patches whose cells are nowhere larger than a pixel write their nodes directly.
+        Patches whose cells are nowhere larger than a pixel write their nodes directly ("quads" and "triangles").
     mip : bool
-        Draw minified patches from coarser levels.
+        Draw minified patches from coarser levels: the coarsest with nodes at most a pixel apart.
     cull : bool
-        Leave out patches that are seen from behind only; right for closed surfaces.
+        Leave out patches that are seen from behind only; right for closed surfaces. Not with "smooth" cells.
     """
 
     nodes: str = "exact"

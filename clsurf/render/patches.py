@@ -151,7 +151,8 @@ def project_patches(device: Device, scratch: Scratch, upload: PatchUpload, view:
     rectangles = scratch.array("patch_rectangles", (upload.count, 4), np.int32)
     boxes = scratch.array("patch_boxes", (upload.count, 4), np.int16)
     device.kernel("render/project_patches.cl", constants=patch_constants(upload) | {
-        "NODES": nodes, "DIRECT": drawing.direct and drawing.cells not in CELLS and not drawing.alpha})(
+        "NODES": nodes, "OVERSHOOT": "0.3f" if drawing.cells == "smooth" else "0.0f",
+        "DIRECT": drawing.direct and drawing.cells not in CELLS and not drawing.alpha})(
         (upload.count,), (min(64, upload.count),), view, upload.frames, upload.sizes, upload.count, records, rectangles,
         boxes)
     return Projected(records, rectangles, boxes)

@@ -9,6 +9,9 @@
 #ifndef NODES
 #define NODES 0   // 0: exact projection; 1: trilinear from the box's corners, 2: the same before the division
 #endif
+#ifndef OVERSHOOT
+#define OVERSHOOT 0.0f  // of the largest difference: smooth cells rise above their nodes, by an eighth of it each way
+#endif
 #ifndef DIRECT
 #define DIRECT 0  // 1: patches of cells smaller than a pixel are drawn node by node
 #endif
@@ -60,7 +63,8 @@ __kernel void project_patches(__global const float *view, __global const float *
     turned(view, f + (part ? 3 * part : AXIS_Z), v);
     h[NX + part] = v[0] * share[part]; h[NY + part] = v[1] * share[part]; h[NZ + part] = v[2] * share[part];
   }
-  float low = f[LOW_STEP], high = f[HIGH_STEP], near = view[NEAR], m = sizes[2 * k] - 1, n = sizes[2 * k + 1] - 1;
+  float more = OVERSHOOT * f[LARGEST_STEP], low = f[LOW_STEP] - more, high = f[HIGH_STEP] + more;
+  float near = view[NEAR], m = sizes[2 * k] - 1, n = sizes[2 * k + 1] - 1;
   float x0 = INFINITY, y0 = INFINITY, x1 = -INFINITY, y1 = -INFINITY, front = INFINITY, back = -INFINITY;
 #if NODES
   float extent = high > low ? high - low : 1.0f, corners[3][8];
