@@ -56,6 +56,20 @@ def test_readme_runs_as_written(ball, tmp_path, monkeypatch, device):
     assert len(clsurf.load("bunny.clsurf")) == len(names["slim"])
 
 
+def test_readmes_patches_run_as_written(slim, tmp_path, monkeypatch, device):
+    """README's second block, with a generated bowl in place of bun.conf."""
+    monkeypatch.chdir(tmp_path)
+    y, x = np.mgrid[:48, :64]
+    depth = (1 + 1e-4 * ((x - 32) ** 2 + (y - 24) ** 2)).astype(np.float32)
+    scan = clsurf.load_frames(depth=[depth], intrinsics=np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
+    code = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[1]
+    assert 'clsurf.load("bun.conf")' in code
+    names = {"slim": slim, "matrix": np.eye(4), "scan": scan}
+    exec(code.replace('clsurf.load("bun.conf")', "scan"), names)
+    assert isinstance(names["patches"], clsurf.PatchSurface) and len(names["patches"]) >= 4
+    assert Path("scans.png").stat().st_size > 1000 and "<svg" in Path("scans.html").read_text(encoding="utf-8")
+
+
 def test_readmes_commands_exist(capsys):
     """Every `clsurf ...` line of README's second shell block names a command and options that its help knows."""
     from clsurf.cli import main
