@@ -64,7 +64,7 @@ def test_readmes_patches_run_as_written(slim, tmp_path, monkeypatch, device):
     scan = clsurf.load_frames(depth=[depth], intrinsics=np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]))
     code = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[1]
     assert 'clsurf.load("bun.conf")' in code
-    names = {"slim": slim, "matrix": np.eye(4), "scan": scan}
+    names = {"clsurf": clsurf, "slim": slim, "matrix": np.eye(4), "scan": scan}
     exec(code.replace('clsurf.load("bun.conf")', "scan"), names)
     assert isinstance(names["patches"], clsurf.PatchSurface) and len(names["patches"]) >= 4
     assert Path("scans.png").stat().st_size > 1000 and "<svg" in Path("scans.html").read_text(encoding="utf-8")
