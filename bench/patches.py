@@ -1,7 +1,8 @@
 """The job `patches`: spatial patches. Faults of pictures, conversions, frames and their modes, VTK, the paper's tables.
 
-A frame time is `Renderer.render` to host arrays of colour, depth and normal, the camera orbiting by 1 degree a frame,
-nothing view-dependent kept. All cases, modes and VTK take turns within one run, in blocks of frames.
+A frame time is `Renderer.render` to host arrays of colour, depth and normal, the camera orbiting by 1 degree a frame on
+the orbit of the job `tiles`, nothing view-dependent kept; "filling" frames the nodes more closely than their box does. All cases, modes and VTK take turns within one run, in blocks of
+frames.
 """
 
 import time
@@ -45,11 +46,11 @@ class Case:
     size: tuple[int, int]
     drawing: dict = field(default_factory=dict)
     vtk: bool = False
-    mode: str = ""
+    filling: bool = False
 
     @property
     def name(self) -> str:
-        return f"{self.scene} {self.size[0]}x{self.size[1]}" + (f" {self.mode}" if self.mode else "")
+        return f"{self.scene} {self.size[0]}x{self.size[1]}" + (" filling" if self.filling else "")
 
 
 def measure(device, quick: bool = False, profile: bool = False) -> dict:
@@ -102,13 +103,17 @@ def chosen_cases(surfaces, quick: bool) -> list[Case]:
     if quick:
         return [Case(earth, PAPER, vtk=True), Case("sphere", SMALL)]
     found = [Case(earth, size, vtk=True) for size in (PAPER, SMALL, FULL_HD)]
+    found += [Case(earth, size, filling=True) for size in (PAPER, FULL_HD)]
     found += [Case("sphere", PAPER, vtk=True), Case("sphere", FULL_HD)]
     return found + [Case(name, PAPER) for name in ("bunny",) if name in surfaces]
 
 
-def orbit(surface, frames: int, size, start: float = 30.0) -> list[Camera]:
-    """Return `frames` cameras that go around the surface, 1 degree a frame; the first one's picture it fills."""
-    first = Camera.framing(surface, views.direction(start, views.ELEVATION), views.FOV, aspect=size[0] / size[1])
+def orbit(surface, frames: int, case: Case, start: float = 30.0) -> list[Camera]:
+    """Return `frames` cameras that go around the surface, 1 degree a frame."""
+    if not case.filling:
+        return views.orbit(surface.bounds, frames, start=start)
+    first = Camera.framing(surface, views.direction(start, views.ELEVATION), views.FOV,
+                           aspect=case.size[0] / case.size[1])
     return [first.orbited(surface.bounds.mean(axis=0), float(i)) for i in range(frames)]
 
 
@@ -150,7 +155,7 @@ def frames(cases, surfaces, device, count: int) -> dict:
     ``frame`` is measured before VTK is loaded, ``frame_beside_vtk`` is what the ratio is made of. ``cores`` is
     processor time over wall time.
     """
-    orbits = {case.name: orbit(surfaces[case.scene], count + WARM, case.size) for case in cases}
+    orbits = {case.name: orbit(surfaces[case.scene], count + WARM, case) for case in cases}
     with Renderer(device) as renderer:
         runners = {case.name: _runner(renderer, surfaces[case.scene], case) for case in cases}
         seconds, cores = in_turns(runners, orbits, count)
@@ -185,7 +190,7 @@ def modes(name: str, surface, device, count: int, size) -> dict:
     cases |= {f"{mode} {SMALL[0]}x{SMALL[1]}": Case(name, SMALL, drawing) for mode, drawing in SMALL_MODES.items()}
     with Renderer(device) as renderer:
         runners = {mode: _runner(renderer, surface, case) for mode, case in cases.items()}
-        orbits = {mode: orbit(surface, count + WARM, case.size) for mode, case in cases.items()}
+        orbits = {mode: orbit(surface, count + WARM, case) for mode, case in cases.items()}
         seconds, _ = in_turns(runners, orbits, count)
     found = {mode: {"frame": record.timing(seconds[mode])} for mode in runners}
     small = f"quads {SMALL[0]}x{SMALL[1]}"
@@ -209,7 +214,7 @@ def _runner(renderer, surface, case: Case):
 def stages(case: Case, surface, device) -> dict:
     """Return the time of each launch of a frame; timed launches wait for each other."""
     with Renderer(device) as renderer:
-        cameras = orbit(surface, 8, case.size)
+        cameras = orbit(surface, 8, case)
         renderer.render(surface, cameras[0], case.size, channels=CHANNELS)
         device.profile = Profile()
         try:

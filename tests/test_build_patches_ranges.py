@@ -207,7 +207,8 @@ def test_quantised_depth_is_smoothed(device):
     ({"spacing": 0.02}, lambda s: 0.018 < np.median(np.linalg.norm(s.axis_x, axis=1)) < 0.022),
     ({"error": 0.002}, lambda s: s.bound / s.diagonal < 0.01),
     ({"nodes": (9, 17)}, lambda s: (s.size == (9, 17)).all()),
-    ({"nodes": 4}, lambda s: s.opaque.mean() > 0.5)], ids=str)
+    ({"nodes": 4}, lambda s: s.opaque.mean() > 0.5)],
+    ids=["patches", "spacing", "finer", "error", "size", "small"])
 def test_requests(device, asked, check):
     scan = RangeScan([sphere_image(96, looking_at_zero(0.0))])
     surface = clsurf.build_patches(scan, device=device, **asked)
