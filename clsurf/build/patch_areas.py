@@ -15,6 +15,7 @@ from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from .patch_edges import ALONG
 from .patch_error import patch_distances
+from .patch_limits import check_patches, check_spacing, least_width, most_of_mesh
 from .patch_strips import cells_beside, cut_graph, fitting_strips, joined, strip_faces, strip_frames
 from .quantize import quantized
 from .resample import REACH, FaceLists, Frames, area_lists, has_colors, resample_faces
@@ -27,8 +28,9 @@ LONGEST_EDGE = 0.5  # of a patch's width: larger faces are cut, so that areas ca
 WIDEST = 0.95  # of what a patch spans: widths along segments.DIRECTIONS fall short of those of the rectangle
 BOUND_SHARE = 0.999  # of the mesh's vertices lie within `bound` of the patches
 BOUND_SAMPLES = 1 << 16
-MOST_PATCHES = 2_000_000  # that a search for an error tries
 SEARCH_STEPS = 8
+BEST_ORDER = 3.0  # power of the spacing that errors never fall faster than; 1.5 to 2 are usual
+FAR = 25.0  # times the last spacing: a search leaps to what is further away
 
 
 @dataclass(frozen=True)
@@ -63,17 +65,29 @@ def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0).astype(np.float64)))
     if not diagonal > 0:
         raise InputError("scan: expected a mesh with some extent, got all corners at one place")
-    if request.error is None:
-        found = converted(mesh, request, device, progress)
+    spans, most = _spans(request.nodes), most_of_mesh(len(mesh.faces), request.nodes)
+    least, widest = least_width(mesh.vertices, mesh.faces, most) / spans.min(), diagonal / spans.min()
+    if request.error is not None:
+        found = _searched(mesh, request, device, progress, (least, widest), diagonal)
     else:
-        found = _searched(mesh, request, device, progress, diagonal)
+        if request.patches:
+            check_patches(request.patches, most, f"a mesh of {len(mesh.faces):,} faces")
+        if request.spacing:
+            check_spacing(request.spacing, least, f"a mesh of {len(mesh.faces):,} faces")
+            request = replace(request, spacing=min(request.spacing, widest))  # one patch spans all then
+        found = converted(mesh, request, device, progress)
     return _with_bound(found, diagonal)
+
+
+def _spans(nodes) -> NDArray:
+    """Return how many node steps (2,) an area may extend along a patch's axes."""
+    return np.asarray(nodes) - 1 - 2 * (REACH - 1)
 
 
 def converted(mesh: Mesh, request, device, progress) -> Conversion:
     """Convert `mesh` with a number of patches or a spacing given, or neither."""
     m, n = request.nodes
-    spans = np.array([m, n]) - 1 - 2 * (REACH - 1)
+    spans = _spans(request.nodes)
     area = _doubled_areas(mesh).sum() / 2
     count = request.patches or max(1, round(len(mesh.vertices) * NODES_A_VERTEX / (m * n)))
     extent = np.ptp(mesh.vertices[mesh.faces.ravel()], axis=0).max()  # of a needle: its area says little
@@ -81,7 +95,8 @@ def converted(mesh: Mesh, request, device, progress) -> Conversion:
     if request.spacing:
         count = max(1, int(area / width ** 2))
     progress(0.0, "areas")
-    mesh, corners, vertices = _prepared(mesh, LONGEST_EDGE * width if width > 0 else np.inf)
+    least = least_width(mesh.vertices, mesh.faces, most_of_mesh(len(mesh.faces), request.nodes))
+    mesh, corners, vertices = _prepared(mesh, LONGEST_EDGE * max(width, least) if width > 0 else np.inf)
     graph = face_graph(vertices, corners)
     if request.patches:
         _check_count(graph, request.patches)
@@ -169,7 +184,7 @@ def framed(graph: FaceGraph, owner: NDArray, count: int, nodes, spacing: float |
         Square cells; relative to the zero of the graph's vertices.
     owner : (f,) int64
     """
-    spans = np.asarray(nodes) - 1 - 2 * (REACH - 1)
+    spans = _spans(nodes)
     normal = graph.normals_of(owner, count)
     box = _rectangles(graph.vertices, graph.corners, owner, count, normal, spans)
     while spacing is not None:
@@ -313,13 +328,16 @@ def _rms(found: Conversion) -> float:
     return math.sqrt(total / max(weight, 1e-300))
 
 
-def _searched(mesh, request, device, progress, diagonal) -> Conversion:
-    """Return the coarsest conversion whose root mean square distance is at most `request.error` of the diagonal."""
+def _searched(mesh, request, device, progress, limits, diagonal) -> Conversion:
+    """Return the coarsest conversion whose root mean square distance is at most `request.error` of the diagonal.
+
+    `limits` are the least and the largest spacing to try.
+    """
     goal, tried = request.error * diagonal, {}
     m, n = request.nodes
     best, area = None, _doubled_areas(mesh).sum() / 2
     spacing = math.sqrt(area / max(len(mesh.vertices) * NODES_A_VERTEX / (m * n), 1)) / (min(m, n) - 1)
-    least = math.sqrt(area / MOST_PATCHES) / (min(m, n) - 1)
+    spacing = min(max(spacing, limits[0]), limits[1])
     for step in range(SEARCH_STEPS):
         done = step / SEARCH_STEPS
         found = converted(mesh, replace(request, error=None, spacing=spacing), device,
@@ -330,12 +348,16 @@ def _searched(mesh, request, device, progress, diagonal) -> Conversion:
             best = spacing, found
         if best is not None and 0.93 * goal <= tried[best[0]]:
             break
-        spacing = max(least, _next_spacing(tried, goal))
+        if best is None and rms * min(limits[0] / spacing, 1) ** BEST_ORDER > goal:
+            break  # not even the finest patches would do
+        spacing = min(max(_next_spacing(tried, goal), limits[0]), limits[1])
         if spacing in tried:
             break
     if best is None:
-        raise InputError(f"error: expected at least {min(tried.values()) / diagonal:.2g} of the diagonal, which the "
-                         f"finest patches tried reach, got {request.error:g}")
+        finest, rms = min(tried.items())
+        reached = rms * min(limits[0] / finest, 1) ** 1.5 / diagonal  # its usual order
+        raise InputError(f"error: expected about {reached:.1g} of the diagonal or more, which the finest patches of "
+                         f"this mesh reach, got {request.error:g}: use a larger one, or more faces")
     return best[1]
 
 
@@ -348,4 +370,5 @@ def _next_spacing(tried: dict[float, float], goal: float) -> float:
         at = math.log(0.97 * goal / max(tried[a], 1e-300)) / math.log(tried[b] / max(tried[a], 1e-300))
         return a * (b / a) ** min(max(at, 0.1), 0.9)
     nearest = max(good) if good else min(bad)
-    return nearest * min(max((0.95 * goal / max(tried[nearest], 1e-300)) ** (1 / 1.5), 0.2), 5.0)
+    times = (0.95 * goal / max(tried[nearest], 1e-300)) ** (1 / 1.5)
+    return nearest * (times if times > FAR else min(max(times, 0.2), 5.0))

@@ -15,6 +15,7 @@ from ..device import Device
 from ..errors import InputError
 from ..surface.patch import PatchSurface
 from .patch_error import patch_distances
+from .patch_limits import widest_spacing
 from .patch_points import SheetPoints, encoded, sheet_points
 from .patch_regions import WIDEN, Regions, Sheet, beside, find_regions, missed_regions
 from .patch_search import searched
@@ -66,8 +67,10 @@ def convert(scan, request, device: Device, step) -> PatchSurface:
     points = sheet_points(scan, device)
     step(0.3, "regions")
     sheet = Sheet(points)
-    surface = searched(lambda spacing, progress: patches_at(sheet, spacing, request, progress), request,
-                       SPACING * points.spacing, sheet.area, FINEST * points.spacing, points.diagonal,
+    finest = FINEST * points.spacing
+    default = min(SPACING * points.spacing, widest_spacing(points.diagonal, finest, request.nodes))  # of few points
+    surface = searched(lambda spacing, progress: patches_at(sheet, spacing, request, progress), request, len(points),
+                       default, sheet.area, finest, points.diagonal,
                        lambda share, what: step(0.3 + 0.7 * share, what))
     step(1.0, "done")
     return surface
@@ -94,7 +97,7 @@ def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request
     """Return the surface, without the patches that show nothing, and its root mean square error; world units."""
     keep = np.concatenate([np.isfinite(part.height).any(axis=(1, 2)) for part in parts])
     if not keep.any():
-        raise InputError("scan: expected points that form a surface, got only scattered ones")
+        raise nothing_shows(points, spacing)
     height = np.concatenate([part.height for part in parts])[keep].astype(np.float64) * points.diagonal
     corner = np.concatenate([part.corner for part in parts])[keep] * points.diagonal + points.middle
     axes = np.concatenate([part.axes for part in parts])[keep]
@@ -113,6 +116,14 @@ def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request
     bound = float(np.quantile(distance, BOUND_SHARE, method="higher"))
     near = distance[distance <= bound]  # strays say nothing about the fit
     return replace(surface, bound=bound, bound_share=BOUND_SHARE), float(np.sqrt(np.mean(near**2)))
+
+
+def nothing_shows(points: SheetPoints, spacing: float, advice: str = "") -> InputError:
+    """Return the error of patches without a node near enough to points."""
+    if spacing > 2 * SPACING * points.spacing:
+        return InputError(f"spacing: expected nodes about as close together as the points, {points.spacing:.3g}, got "
+                          f"{spacing:.3g}, where nothing of the scan shows: use a smaller spacing, or more patches")
+    return InputError(f"scan: expected points that form a surface, got only scattered ones{advice}")
 
 
 def own_distance(sheet: Sheet, patches: Patches, gap: float) -> NDArray:
@@ -199,7 +210,8 @@ def fitted(sheet: Sheet, regions: Regions, gap: float, size, thick: bool = True)
            *tree.arguments, device.upload(region), light, out)
     height, near2, cell2, known, *light = device.download(out)
     farthest = max(FARTHEST * points.nearest, SUPPORT * points.spacing) / points.diagonal
-    support = np.maximum(np.minimum(SUPPORT * regions.spacing, farthest), 0.75 * gap)
+    # Half a diagonal: of the few points of a tiny cloud, whose spacing is their extent.
+    support = np.maximum(np.minimum(SUPPORT * regions.spacing, min(farthest, 0.5)), 0.75 * gap)
     shows = supported(known > 0, near2, cell2, support)
     return Patches(regions, corner, axes, np.where(shows, height, np.float32("nan")),
                    np.stack(light) if colored else None)

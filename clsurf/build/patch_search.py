@@ -4,12 +4,16 @@ import logging
 
 import numpy as np
 
+from ..errors import InputError
+from .patch_limits import FILLED, check_patches, check_spacing, most_of_cloud, widest_spacing
+
 log = logging.getLogger("clsurf")
 
 TRIALS = 8  # spacings tried
 
 
-def searched(at, request, default: float, area: float, finest: float, diagonal: float, step):
+def searched(at, request, count: int, default: float, area: float, finest: float, diagonal: float, step,
+             sparse: float = 0.0):
     """Return the surface that `request` asks for.
 
     Parameters
@@ -17,6 +21,8 @@ def searched(at, request, default: float, area: float, finest: float, diagonal: 
     at : callable
         at(spacing, progress) gives a PatchSurface and its root mean square error, world units.
     request : PatchRequest
+    count : int
+        Points of the scan.
     default : float
         Spacing where nothing is asked for, world units.
     area : float
@@ -27,21 +33,44 @@ def searched(at, request, default: float, area: float, finest: float, diagonal: 
         What the error is relative to.
     step : callable
         step(fraction, what), from 0 to 1.
+    sparse : float
+        Spacing below which no number of patches leads: most nodes would be missing.
     """
+    m, n = request.nodes
+    widest = max(widest_spacing(diagonal, finest, request.nodes), default)
+    most, scan = most_of_cloud(count, request.nodes), f"a cloud of {count:,} points"
+    least = min(float(np.sqrt(area / (FILLED * most * (m - 1) * (n - 1)))), finest, widest)
     if request.patches is not None:
-        m, n = request.nodes
-        return with_count(at, request.patches, float(np.sqrt(area / (0.4 * request.patches * (m - 1) * (n - 1)))), step)
+        check_patches(request.patches, most, scan)
+        first = float(np.sqrt(area / (0.4 * request.patches * (m - 1) * (n - 1))))
+        return with_count(at, request.patches, first, default, (max(least, sparse), widest), step)
     if request.error is not None:
         coarsest = max(0.5 * diagonal / (min(request.nodes) - 1), 1.01 * finest)
         return with_error(at, request.error * diagonal, finest, coarsest, step)
-    return at(default if request.spacing is None else float(request.spacing), step)[0]
+    if request.spacing is not None:
+        check_spacing(request.spacing, least, scan)
+    return at(default if request.spacing is None else min(float(request.spacing), widest), step)[0]
 
 
-def with_count(at, wanted: int, spacing: float, step):
-    """Return a surface of at most `wanted` patches and close to as many, or else that of the fewest found."""
+def with_count(at, wanted: int, spacing: float, default: float, limits, step):
+    """Return a surface of at most `wanted` patches and close to as many, or else that of the fewest found.
+
+    `limits` are the least and the largest spacing to try; `default` is one that shows the surface if any does.
+    """
     best, low, high = None, 0.0, np.inf  # spacings known to give too many, and few enough
+    failed, tried = None, set()
     for trial in range(TRIALS):
-        surface, _ = at(spacing, _part(step, trial))
+        spacing = float(min(max(spacing, limits[0]), limits[1]))
+        if spacing in tried:
+            break
+        tried.add(spacing)
+        try:
+            surface, _ = at(spacing, _part(step, trial))
+        except InputError as error:  # too coarse for anything to show, or too fine for the images of views
+            failed = error
+            low, high = (low, min(high, spacing)) if spacing > default else (max(low, spacing), high)
+            spacing = default if default not in tried else np.sqrt(spacing * default)
+            continue
         count = len(surface)
         if best is None or _rank(count, wanted) < _rank(len(best), wanted):
             best = surface
@@ -51,6 +80,8 @@ def with_count(at, wanted: int, spacing: float, step):
         guess = spacing * np.sqrt(count / (0.98 * wanted))
         inside = low * 1.002 < guess < high * 0.998
         spacing = guess if inside else np.sqrt(low * high) if 0 < low and high < np.inf else guess
+    if best is None:
+        raise failed
     return best
 
 

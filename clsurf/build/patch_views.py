@@ -14,7 +14,7 @@ from scipy import ndimage
 from ..device import Device
 from ..errors import InputError
 from ..surface.patch import PatchSurface
-from .patch_local import BOUND_SHARE, FINEST, SPACING, distances, in_whole_cells
+from .patch_local import BOUND_SHARE, FINEST, SPACING, distances, in_whole_cells, nothing_shows
 from .patch_points import SheetPoints, encoded, sheet_points
 from .patch_search import searched
 from .quantize import quantized
@@ -26,6 +26,7 @@ THICKNESS = 1.5  # points this far behind the nearest one of a pixel, over its s
 FLAT = 0.35  # least cosine between a pixel's normal and the view for it to be a node
 GOOD = 0.55  # the same for points that a view is chosen for and that count as shown
 NOISY = 0.2  # noise over the spacing from which the images are smoothed
+SPARSE = 0.6  # times the points' spacing: images with smaller pixels have more gaps than points
 LEAST = 6  # points not shown before that a patch must show
 SIDE_LIMIT = 1 << 14  # pixels of a range image along a side
 
@@ -57,9 +58,9 @@ def convert(scan, request, device: Device, step) -> PatchSurface:
     step(0.0, "points")
     points = sheet_points(scan, device)
     area = float((points.local.astype(np.float64) ** 2).sum())
-    surface = searched(lambda spacing, progress: patches_at(points, spacing, request, progress), request,
+    surface = searched(lambda spacing, progress: patches_at(points, spacing, request, progress), request, len(points),
                        SPACING * points.spacing, area, FINEST * points.spacing, points.diagonal,
-                       lambda share, what: step(0.3 + 0.7 * share, what))
+                       lambda share, what: step(0.3 + 0.7 * share, what), SPARSE * points.spacing)
     step(1.0, "done")
     return surface
 
@@ -97,7 +98,7 @@ def patches_at(points: SheetPoints, spacing: float, request, step) -> tuple[Patc
             parts.append(found)
             count += len(found[0])
     if not count:
-        raise InputError("scan: expected points that form a surface, got only scattered ones: use method local")
+        raise nothing_shows(points, spacing, ": use method local")
     corner, axes, height = (np.concatenate(part) for part in list(zip(*parts, strict=True))[:3])
     light = None if points.light is None else np.concatenate([part[3] for part in parts])
     colors = None

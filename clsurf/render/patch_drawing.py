@@ -53,5 +53,8 @@ class PatchDrawing:
     def __post_init__(self):
         for name, choices in CHOICES.items():
             value = getattr(self, name)
-            if value not in choices:
+            if not isinstance(value, bool | str) or value not in choices:
                 raise InputError(f"patches {name}: expected one of {', '.join(map(str, choices))}, got {value!r}")
+        for name in ("alpha", "direct", "mip", "cull"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"patches {name}: expected True or False, got {getattr(self, name)!r}")
