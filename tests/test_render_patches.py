@@ -8,6 +8,7 @@ from test_render_patch_modes import sheet as sheet_and_places
 
 from clsurf.build.quantize import quantized
 from clsurf.build.slim import build_slim
+from clsurf.models import perfect_sphere
 from clsurf.models.basic import torus
 from clsurf.render.camera import Camera
 from clsurf.render.patch_drawing import PatchDrawing
@@ -268,3 +269,29 @@ def test_culling_leaves_out_what_is_seen_from_behind_only(renderers):
     np.testing.assert_allclose(got.depth, want.depth, atol=1e-5)
     empty = renderers().render(surface, inside, SIZE, patches=PatchDrawing(direct=False, mip=False, cull=True))
     assert np.isnan(empty.depth).all()
+
+
+@pytest.mark.parametrize("lanes", [1, 16])
+@pytest.mark.parametrize("inside", [False, True])
+def test_normals_at_contours_stay_beside_those_of_the_sphere(renderers, lanes, inside):
+    # From inside of half a sphere its back shows: there normals are turned over.
+    surface = globe(200, 9)
+    camera = Camera.look_at((0.3, 0.2, 0.5), (0, 0, 0), fov=100) if inside else CAMERAS["perspective"]
+    for direct in (False, True):
+        frame = renderers(lanes).render(surface, camera, (160, 120), ("normal", "depth", "position"),
+                                        patches=PatchDrawing(direct=direct, mip=False))
+        shown = np.isfinite(frame.depth)
+        exact = frame.position[shown] + frame.origin
+        exact *= (-1 if inside else 1) / np.linalg.norm(exact, axis=1, keepdims=True)
+        assert shown.sum() > 2000
+        assert np.degrees(np.arccos(np.clip((frame.normal[shown] * exact).sum(axis=1), -1, 1))).max() < 8
+
+
+@pytest.mark.parametrize("nodes", ["exact", "trilinear"])
+def test_contours_have_no_specks(renderers, nodes):
+    frame = renderers().render(perfect_sphere(), None, (150, 150), ("normal", "depth", "position"),
+                               patches=PatchDrawing(nodes=nodes))
+    shown = np.isfinite(frame.depth)
+    exact = frame.position[shown] + frame.origin
+    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+    assert (frame.normal[shown] * exact).sum(axis=1).min() > np.cos(np.radians(20))

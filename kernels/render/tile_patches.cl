@@ -426,6 +426,20 @@ typedef struct {
   int count;
 } Patches;
 
+// Interpolated normals that look away from the eye by `side` < 0: turned over where their facet, of slopes (fx, fy), shows its
+// back by more than CONTOUR, the sine of an angle. Elsewhere, at contours, only what points away is mirrored: turned over they
+// would point almost the other way. Nodes drawn as they are have no facet: there the normal itself decides, by more.
+#define CONTOUR 0.05f
+INLINE void face_eye(__global const float *h, int direct, VF fx, VF fy, VF ex, VF ey, VF side, VF *nx, VF *ny, VF *nz) {
+  VF x = h[NX] - fx * h[NX + 1] - fy * h[NX + 2], y = h[NY] - fx * h[NY + 1] - fy * h[NY + 2];
+  VF z = h[NZ] - fx * h[NZ + 1] - fy * h[NZ + 2], e2 = ex * ex + ey * ey + 1.0f, back = x * ex + y * ey + z;
+  VF least = (x * x + y * y + z * z) * e2 * (direct ? 25.0f * CONTOUR * CONTOUR : CONTOUR * CONTOUR);
+  VI away = side < 0.0f, over = away & (back < 0.0f) & (back * back > least);
+  VF mirror = 2.0f * side / e2;
+  mirror = SEL((VF)(0.0f), mirror, away);
+  *nx = SEL(*nx - mirror * ex, -*nx, over); *ny = SEL(*ny - mirror * ey, -*ny, over); *nz = SEL(*nz - mirror, -*nz, over);
+}
+
 // What the winners show at pixels (px, py); `payload` NO_SAMPLE: nothing.
 INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, VU payload, VF px, VF py) {
   Shown out;
@@ -434,6 +448,8 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
   out.nx = zero; out.ny = zero; out.nz = 1.0f; out.red = zero; out.green = zero; out.blue = zero;
   out.id = 0; out.count = 1; out.level = 0;
   int perspective = view[PERSPECTIVE] > 0.0f;
+  VF ex = zero, ey = zero;  // towards the eye, z 1
+  if (perspective) { ex = (px - view[CX]) * (-1.0f / view[FX]); ey = (py - view[CY]) * (1.0f / view[FY]); }
   VI left = payload != (VU)(NO_SAMPLE);
   // A patch at a time: its record is the same for all its lanes, and 16 pixels show one or two.
   for (uint bits = lane_mask(left); bits; bits = lane_mask(left)) {
@@ -449,12 +465,13 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
     VI i = within - j * m;
     VI low = i < 0, high = i >= (VI)(m);  // the division was rounded
     j = SEL(SEL(j, j - 1, low), j + 1, high); i = within - j * m;
-    VF fi = TO_VF(i), fj = TO_VF(j), x, y, z, w, depth = zero, gx, gy, red = zero, green = zero, blue = zero;
+    VF fi = TO_VF(i), fj = TO_VF(j), x, y, z, w, depth = zero, gx, gy, fx, fy, red = zero, green = zero, blue = zero;
     VU a[4];
     GATHERED(a, nodes.nodes, at)
     if (flags & PATCH_DIRECT) {
       project_nodes(h, perspective, fi, fj, AS_VF(a[0]), &x, &y, &depth, &w);
       gx = SLOPE_X(a); gy = SLOPE_Y(a);
+      fx = gx * h[SLOPE_SCALE]; fy = gy * h[SLOPE_SCALE];
 #if FIELD_COLOR >= 0 && CHANNELS
       red = RED(a); green = GREEN(a); blue = BLUE(a);
 #endif
@@ -503,6 +520,13 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
 #else
       gx = MEAN(SLOPE_X); gy = MEAN(SLOPE_Y);
 #endif
+      // Slopes of the facet itself.
+      VF fa = AS_VF(a[0]), fb = AS_VF(b[0]) - fa, fc = AS_VF(c[0]) - fa, fd = AS_VF(d[0]) - fa;
+#if TRIANGLES
+      fx = SEL(fd - fc, fb, s >= t); fy = SEL(fc, fd - fb, s >= t);
+#else
+      fx = fb + t * (fd - fb - fc); fy = fc + s * (fd - fb - fc);
+#endif
 #if LATTICE
       // Depth and normal are carried on beyond the cell, colours are not: they could leave their range.
       s = limited(s, zero, (VF)(1.0f)); t = limited(t, zero, (VF)(1.0f));
@@ -518,9 +542,11 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
 #if FIELD_LEVEL >= 0
     out.level = SEL(out.level, (VI)(flags >> PATCH_LEVEL), mine);
 #endif
-    out.nx = SEL(out.nx, h[NX] - gx * h[NX + 1] - gy * h[NX + 2], mine);
-    out.ny = SEL(out.ny, h[NY] - gx * h[NY + 1] - gy * h[NY + 2], mine);
-    out.nz = SEL(out.nz, h[NZ] - gx * h[NZ + 1] - gy * h[NZ + 2], mine);
+    VF nx = h[NX] - gx * h[NX + 1] - gy * h[NX + 2], ny = h[NY] - gx * h[NY + 1] - gy * h[NY + 2],
+       nz = h[NZ] - gx * h[NZ + 1] - gy * h[NZ + 2];
+    VF side = nx * ex + ny * ey + nz;
+    if (any_lane(mine & (side < 0.0f))) face_eye(h, flags & PATCH_DIRECT, fx, fy, ex, ey, side, &nx, &ny, &nz);
+    out.nx = SEL(out.nx, nx, mine); out.ny = SEL(out.ny, ny, mine); out.nz = SEL(out.nz, nz, mine);
 #if FIELD_COLOR >= 0 && CHANNELS
     out.red = SEL(out.red, red, mine); out.green = SEL(out.green, green, mine); out.blue = SEL(out.blue, blue, mine);
 #endif
@@ -532,12 +558,6 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
   out.red = view[PATCH_COLOR]; out.green = view[PATCH_COLOR + 1]; out.blue = view[PATCH_COLOR + 2];
 #endif
 #endif
-  // The side that faces the eye.
-  VF ex = zero, ey = zero;
-  if (perspective) { ex = (px - view[CX]) * (-1.0f / view[FX]); ey = (py - view[CY]) * (1.0f / view[FY]); }
-  VF side = out.nx * ex + out.ny * ey + out.nz;
-  VI away = side < 0.0f;
-  out.nx = SEL(out.nx, -out.nx, away); out.ny = SEL(out.ny, -out.ny, away); out.nz = SEL(out.nz, -out.nz, away);
   return out;
 }
 
