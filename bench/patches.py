@@ -1,8 +1,8 @@
 """The job `patches`: spatial patches. Faults of pictures, conversions, frames and their modes, VTK, the paper's tables.
 
 A frame time is `Renderer.render` to host arrays of colour, depth and normal, the camera orbiting by 1 degree a frame on
-the orbit of the job `tiles`, nothing view-dependent kept; "filling" frames the nodes more closely than their box does. All cases, modes and VTK take turns within one run, in blocks of
-frames.
+the orbit of the job `tiles`, nothing view-dependent kept; "filling" frames the nodes more closely than their box does.
+All cases, modes and VTK take turns within one run, in blocks of frames.
 """
 
 import time

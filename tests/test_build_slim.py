@@ -337,7 +337,7 @@ def test_refuses_scans_without_extent(device, points):
 
 
 def test_refuses_other_things(device, tmp_path):
-    with pytest.raises(InputError, match="scan: expected a Mesh, a PointCloud, a RangeScan or the path of a scan, got int"):
+    with pytest.raises(InputError, match="expected a Mesh, a PointCloud, a RangeScan or the path of a scan, got int"):
         build_slim(3, device=device)
     with pytest.raises(InputError):
         build_slim(tmp_path / "none.ply", device=device)
