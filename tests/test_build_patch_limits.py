@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from reference import patches as twin
 
+from clsurf.build.patch_areas import DEFAULT_NODES
 from clsurf.build.patch_limits import LEAST_NODES, NODES_A_FACE, least_width, most_of_cloud, most_of_mesh
 from clsurf.build.patch_search import with_count
 from clsurf.build.patch_views import sphere_directions
@@ -58,6 +59,11 @@ def test_one_patch_of_a_plane(device):
     for request in ({"patches": 1}, {"spacing": 1e9}):
         surface = build_patches(flat, device=device, **request)
         assert len(surface) == 1 and 1.8 < widest(surface) < 2.5
+
+
+def test_few_vertices_get_patches_enough(device):
+    surface = build_patches(twin.ball(1), device=device)
+    assert surface.size.prod(axis=1).sum() >= 0.9 * DEFAULT_NODES
 
 
 def test_three_points_stay_small(device):

@@ -22,6 +22,7 @@ from .resample import REACH, FaceLists, Frames, area_lists, has_colors, resample
 from .segments import FaceGraph, face_graph, partition, split_faces, sums
 
 NODES_A_VERTEX = 441_014 / 34_834  # of the paper's bunny (Table 1): the mesh's own resolution
+DEFAULT_NODES = 60 * 289  # at least: a cylinder of 66 vertices had teeth along its rims with 6 patches
 ANGLES = 12  # within 90 degrees, that rectangles around areas are tried at
 UNFILLED = 1.3  # spacing over that of patches that areas fill whole; areas fill 0.6 of them
 LONGEST_EDGE = 0.5  # of a patch's width: larger faces are cut, so that areas can end within them
@@ -46,7 +47,8 @@ class Conversion:
 def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
     """Return the patches of a mesh: exactly `request.patches`, or of `request.spacing`, or as good as `request.error`.
 
-    With none of them the number of nodes goes with that of vertices, as in the paper's Table 1; more patches are made
+    With none of them the number of nodes goes with that of vertices, as in the paper's Table 1, `DEFAULT_NODES` at
+    least; more patches are made
     where cones, creases and separate parts of the mesh ask for them. The strips along sharp edges count as patches.
 
     Raises
@@ -89,7 +91,7 @@ def converted(mesh: Mesh, request, device, progress) -> Conversion:
     m, n = request.nodes
     spans = _spans(request.nodes)
     area = _doubled_areas(mesh).sum() / 2
-    count = request.patches or max(1, round(len(mesh.vertices) * NODES_A_VERTEX / (m * n)))
+    count = request.patches or max(1, round(max(len(mesh.vertices) * NODES_A_VERTEX, DEFAULT_NODES) / (m * n)))
     extent = np.ptp(mesh.vertices[mesh.faces.ravel()], axis=0).max()  # of a needle: its area says little
     width = request.spacing * spans.min() if request.spacing else max(math.sqrt(area / count), extent / (8 * count))
     if request.spacing:
