@@ -33,6 +33,11 @@ inline void trilinear(const float *v, float m, float n, float low, float e, __gl
 }
 #endif
 
+// Comparisons: PoCL's fmin, fmax and fabs are calls.
+#define LESS(a, b) ((b) < (a) ? (b) : (a))
+#define MORE(a, b) ((b) > (a) ? (b) : (a))
+#define SIZE(x) ((x) < 0.0f ? -(x) : (x))
+
 inline void turned(__global const float *view, __global const float *v, float *out) {
   for (int r = 0; r < 3; r++) out[r] = view[3 * r] * v[0] + view[3 * r + 1] * v[1] + view[3 * r + 2] * v[2];
 }
@@ -74,9 +79,9 @@ __kernel void project_patches(__global const float *view, __global const float *
     high = low + extent;
 #endif
     Node p = node_at(h, perspective, corner & 1 ? m : 0, corner & 2 ? n : 0, corner & 4 ? high : low);
-    front = fmin(front, p.z); back = fmax(back, p.z);
+    front = LESS(front, p.z); back = MORE(back, p.z);
     float inv = 1.0f / p.w;
-    x0 = fmin(x0, p.x * inv); x1 = fmax(x1, p.x * inv); y0 = fmin(y0, p.y * inv); y1 = fmax(y1, p.y * inv);
+    x0 = LESS(x0, p.x * inv); x1 = MORE(x1, p.x * inv); y0 = LESS(y0, p.y * inv); y1 = MORE(y1, p.y * inv);
 #if NODES
     corners[0][corner] = NODES == 1 ? p.x * inv : p.x; corners[1][corner] = NODES == 1 ? p.y * inv : p.y;
     corners[2][corner] = p.z;
@@ -91,9 +96,9 @@ __kernel void project_patches(__global const float *view, __global const float *
     // The sides of a cell in pixels: from node a to b, x changes by (change of x w - x_b change of w) / w_a.
     float inv = perspective ? 1.0f / front : 1.0f, turn = perspective ? 1.0f : 0.0f, wide = 0.0f, tall = 0.0f;
     for (int side = 1; side < 3; side++) {
-#define CHANGE(H, at) (fabs(h[H + side] - at * turn * h[HZ + side]) + f[LARGEST_STEP] * fabs(h[H + 3] - at * turn * h[HZ + 3]))
-      wide += inv * fmax(CHANGE(HX, x0), CHANGE(HX, x1));
-      tall += inv * fmax(CHANGE(HY, y0), CHANGE(HY, y1));
+#define CHANGE(H, at) (SIZE(h[H + side] - at * turn * h[HZ + side]) + f[LARGEST_STEP] * SIZE(h[H + 3] - at * turn * h[HZ + 3]))
+      wide += inv * MORE(CHANGE(HX, x0), CHANGE(HX, x1));
+      tall += inv * MORE(CHANGE(HY, y0), CHANGE(HY, y1));
     }
     if (DIRECT && wide <= 1.0f && tall <= 1.0f) flags = PATCH_DIRECT;
     if (wide > LARGE_PX || tall > LARGE_PX) flags = PATCH_LARGE;
@@ -102,8 +107,8 @@ __kernel void project_patches(__global const float *view, __global const float *
   h[PATCH_NEAR] = front > near ? front : near;
   h[SLOPE_SCALE] = f[SCALE_OF_SLOPES];
   // 1/32 pixel covers float rounding.
-  x0 = fmax(ceil(x0 - 0.53125f), 0.0f); x1 = fmin(floor(x1 - 0.46875f), view[WIDTH] - 1.0f);
-  y0 = fmax(ceil(y0 - 0.53125f), 0.0f); y1 = fmin(floor(y1 - 0.46875f), view[HEIGHT] - 1.0f);
+  x0 = MORE(ceil(x0 - 0.53125f), 0.0f); x1 = LESS(floor(x1 - 0.46875f), view[WIDTH] - 1.0f);
+  y0 = MORE(ceil(y0 - 0.53125f), 0.0f); y1 = LESS(floor(y1 - 0.46875f), view[HEIGHT] - 1.0f);
   int shown = f[LOW_STEP] <= f[HIGH_STEP] && back > near && x0 <= x1 && y0 <= y1;
   rectangles[k] = shown ? (int4)((int)x0, (int)y0, (int)x1, (int)y1) : (int4)(1, 1, 0, 0);
   boxes[k] = shown ? (short4)((short)(x0 / BIN), (short)(y0 / BIN), (short)(x1 / BIN), (short)(y1 / BIN))

@@ -130,6 +130,31 @@ INLINE void draw_cells(const Target *to, Spot a, Spot b, Spot c, Spot d, VI draw
 #if VW == 1
   folded = folded != 0;
 #endif
+#if VW == 16
+  // Cells of at most 2x2 pixels, the most: all four at once, without branches, then their hits in one go.
+  VI wide = drawn & (folded | (last_x - first_x > 1) | (last_y - first_y > 1));
+  if (!any_lane(wide)) {
+    VI slots[4];
+    VU keys[4];
+    uint masks[2] = {0, 0};
+    for (int q = 0; q < 4; q++) {
+      VI column = first_x + (q & 1), row = first_y + (q >> 1);
+      VF px = TO_VF(column) + 0.5f, py = TO_VF(row) + 0.5f;
+      VI hit = drawn & (column <= last_x) & (row <= last_y)
+             & in_convex(a.x - px, a.y - py, e.x - px, e.y - py, f.x - px, f.y - py, d.x - px, d.y - py);
+      keys[q] = fit_key(to->view, &fit, px, py, large);
+      column -= to->x; row -= to->y;
+      slots[q] = SLOT_OF(column, row);
+      masks[q >> 1] |= lane_mask(hit) << 16 * (q & 1);
+    }
+    for (int pair = 0; pair < 2; pair++)
+      for (uint bits = masks[pair]; bits; bits &= bits - 1) {
+        int l = FIRST_LANE(bits);
+        put_lane(to, ((const int *)(slots + 2 * pair))[l], ((const uint *)(keys + 2 * pair))[l], payload + (l & 15));
+      }
+    return;
+  }
+#endif
   // Folded cells, a few at silhouettes, take a round of their own.
   for (int odd = 0; odd < 2; odd++) {
     VI live = drawn & (odd ? folded : NOT(folded));
@@ -451,36 +476,46 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
   VF ex = zero, ey = zero;  // towards the eye, z 1
   if (perspective) { ex = (px - view[CX]) * (-1.0f / view[FX]); ey = (py - view[CY]) * (1.0f / view[FY]); }
   VI left = payload != (VU)(NO_SAMPLE);
-  // A patch at a time: its record is the same for all its lanes, and 16 pixels show one or two.
+  if (!any_lane(left)) return out;
+  // Which patches: 16 pixels show about two.
+  uint lead = ((const uint *)&payload)[FIRST_LANE(lane_mask(left))], found[VW];
+  int number = 0, cells = 0;
+  VU at = SEL((VU)(lead), payload, left), start = lead;
+  VI row = 1, rank = -1;
   for (uint bits = lane_mask(left); bits; bits = lane_mask(left)) {
-    uint node = ((const uint *)&payload)[FIRST_LANE(bits)], k = patch_of(node, patches.offsets, patches.count);
+    uint k = patch_of(((const uint *)&payload)[FIRST_LANE(bits)], patches.offsets, patches.count);
     uint first = patches.offsets[k], last = patches.offsets[k + 1];
     VI mine = left & (payload >= (VU)(first)) & (payload < (VU)(last));
     left = left & NOT(mine);
-    __global const float *h = patches.records + (size_t)k * PATCH_STRIDE;
-    int m = patches.sizes[2 * k], flags = as_int(h[PATCH_FLAGS]);
-    VU at = SEL((VU)(first), payload, mine);
-    VI within = AS_VI(at - (VU)(first));
-    VI j = TO_VI((TO_VF(within) + 0.5f) * (1.0f / (float)m));
-    VI i = within - j * m;
-    VI low = i < 0, high = i >= (VI)(m);  // the division was rounded
-    j = SEL(SEL(j, j - 1, low), j + 1, high); i = within - j * m;
-    VF fi = TO_VF(i), fj = TO_VF(j), x, y, z, w, depth = zero, gx, gy, fx, fy, red = zero, green = zero, blue = zero;
-    VU a[4];
-    GATHERED(a, nodes.nodes, at)
+    start = SEL(start, (VU)(first), mine);
+    row = SEL(row, (VI)(patches.sizes[2 * k]), mine);
+    rank = SEL(rank, (VI)(number), mine);
+    cells |= !(as_int(patches.records[(size_t)k * PATCH_STRIDE + PATCH_FLAGS]) & PATCH_DIRECT);
+    found[number++] = k;
+  }
+  // The nodes of all lanes at once.
+  VI within = AS_VI(at - start), j = TO_VI((TO_VF(within) + 0.5f) * (1.0f / TO_VF(row))), i = within - j * row;
+  VI low = i < 0, high = i >= row;  // the division was rounded
+  j = SEL(SEL(j, j - 1, low), j + 1, high); i = within - j * row;
+  VF fi = TO_VF(i), fj = TO_VF(j), across_s = zero, across_t = zero;
+  VU a[4], b[4], c[4], d[4], next = at + 1, above = at + AS_VU(row), across = above + 1;
+  GATHERED(a, nodes.nodes, at)
+  if (cells) {
+    GATHERED(b, nodes.nodes, next)
+    GATHERED(c, nodes.nodes, above)
+    GATHERED(d, nodes.nodes, across)
+  } else for (int q = 0; q < 4; q++) b[q] = c[q] = d[q] = a[q];
+  // A patch at a time: its record is the same for all its lanes.
+  for (int g = 0; g < number; g++) {
+    VI mine = rank == g;
+    __global const float *h = patches.records + (size_t)found[g] * PATCH_STRIDE;
+    int flags = as_int(h[PATCH_FLAGS]);
+    VF x, y, z, w, depth = zero, gx, gy, fx, fy, s = zero, t = zero;
     if (flags & PATCH_DIRECT) {
       project_nodes(h, perspective, fi, fj, AS_VF(a[0]), &x, &y, &depth, &w);
       gx = SLOPE_X(a); gy = SLOPE_Y(a);
       fx = gx * h[SLOPE_SCALE]; fy = gy * h[SLOPE_SCALE];
-#if FIELD_COLOR >= 0 && CHANNELS
-      red = RED(a); green = GREEN(a); blue = BLUE(a);
-#endif
     } else {
-      VU b[4], c[4], d[4], next = at + 1, above = at + (uint)m, across = at + (uint)m + 1;
-      GATHERED(b, nodes.nodes, next)
-      GATHERED(c, nodes.nodes, above)
-      GATHERED(d, nodes.nodes, across)
-      VF s = zero, t = zero;
 #if LATTICE || SMOOTH_NORMALS
       Heights cell;
 #define CORNER(k, n, node) cell.d[k] = AS_VF(n[0]); cell.gx[k] = SLOPE_X(n) * h[SLOPE_SCALE]; \
@@ -527,14 +562,6 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
 #else
       fx = fb + t * (fd - fb - fc); fy = fc + s * (fd - fb - fc);
 #endif
-#if LATTICE
-      // Depth and normal are carried on beyond the cell, colours are not: they could leave their range.
-      s = limited(s, zero, (VF)(1.0f)); t = limited(t, zero, (VF)(1.0f));
-      wd = s * t; wb = s - wd; wc = t - wd; wa = 1.0f - s - wc;
-#endif
-#if FIELD_COLOR >= 0 && CHANNELS
-      red = MEAN(RED); green = MEAN(GREEN); blue = MEAN(BLUE);
-#endif
     }
     float scale = h[SLOPE_SCALE];
     gx *= scale; gy *= scale;
@@ -547,13 +574,18 @@ INLINE Shown resolve(__global const float *view, Patches patches, Nodes nodes, V
     VF side = nx * ex + ny * ey + nz;
     if (any_lane(mine & (side < 0.0f))) face_eye(h, flags & PATCH_DIRECT, fx, fy, ex, ey, side, &nx, &ny, &nz);
     out.nx = SEL(out.nx, nx, mine); out.ny = SEL(out.ny, ny, mine); out.nz = SEL(out.nz, nz, mine);
-#if FIELD_COLOR >= 0 && CHANNELS
-    out.red = SEL(out.red, red, mine); out.green = SEL(out.green, green, mine); out.blue = SEL(out.blue, blue, mine);
-#endif
+    across_s = SEL(across_s, s, mine); across_t = SEL(across_t, t, mine);
   }
 #if FIELD_COLOR >= 0
 #if CHANNELS
-  out.red *= COLOR_UNIT; out.green *= COLOR_UNIT; out.blue *= COLOR_UNIT;
+#if LATTICE
+  // Depth and normal are carried on beyond the cell, colours are not: they could leave their range.
+  across_s = limited(across_s, zero, (VF)(1.0f)); across_t = limited(across_t, zero, (VF)(1.0f));
+#endif
+  VF wd = across_s * across_t, wb = across_s - wd, wc = across_t - wd, wa = 1.0f - across_s - wc, none = 0.0f;
+  rank = rank >= 0;
+#define COLOR(f) SEL(none, MEAN(f) * COLOR_UNIT, rank)
+  out.red = COLOR(RED); out.green = COLOR(GREEN); out.blue = COLOR(BLUE);
 #else
   out.red = view[PATCH_COLOR]; out.green = view[PATCH_COLOR + 1]; out.blue = view[PATCH_COLOR + 2];
 #endif
