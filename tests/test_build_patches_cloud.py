@@ -5,10 +5,11 @@ import pytest
 
 from bench.patch_coverage import coverage, distance_to_cells, opaque_cells, point_spacing
 from clsurf.build import patch_local, patch_regions, patch_seeds, patch_views
-from clsurf.build.patch_points import encoded, linear_light, sheet_points
+from clsurf.build.patch_points import sheet_points
 from clsurf.build.patches import build_patches
 from clsurf.errors import Cancelled, InputError
 from clsurf.surface.cloud import PointCloud
+from clsurf.surface.srgb import premultiplied, straight
 from tests.reference import patch_cloud as twin
 
 RNG = np.random.default_rng(3)
@@ -228,9 +229,9 @@ def test_colors(device, method):
     assert (black.colors[black.opaque] == 1).all()
 
 
-def test_linear_light_and_back():
+def test_premultiplied_and_back():
     colors = RNG.integers(1, 256, (500, 4)).astype(np.uint8)
-    assert np.abs(encoded(linear_light(colors)).astype(int) - colors).max() <= 1
+    assert np.abs(straight(premultiplied(colors)).astype(int) - colors).max() <= 1
 
 
 @pytest.mark.parametrize("method", ["local", "global_views"])

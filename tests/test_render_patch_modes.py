@@ -21,7 +21,8 @@ from clsurf.render.patch_nodes import LIT_RANGE, light_nodes, table_normals
 from clsurf.render.patches import patch_constants, place_patches, project_patches, upload_patches
 from clsurf.render.renderer import Renderer
 from clsurf.render.scene import Scene
-from clsurf.render.shade import Light, Shading, shading_floats, to_linear
+from clsurf.render.shade import Light, Shading, shading_floats
+from clsurf.surface.srgb import to_linear
 from clsurf.render.tiles import Scratch, view_floats
 from clsurf.surface.patch import PatchSurface
 

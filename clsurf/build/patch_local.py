@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 from ..device import Device
 from ..errors import InputError
 from ..surface.patch import PatchSurface
+from ..surface.srgb import straight
 from .patch_error import patch_distances
 from .patch_limits import widest_spacing
-from .patch_points import SheetPoints, encoded, sheet_points
+from .patch_points import SheetPoints, sheet_points
 from .patch_regions import WIDEN, Regions, Sheet, beside, find_regions, missed_regions
 from .patch_search import searched
 from .quantize import quantized
@@ -106,7 +107,7 @@ def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request
         colors = np.zeros((height.size, 4 if request.precise else 3), np.uint8)
         shows = np.isfinite(height.ravel())
         light = np.concatenate([part.light for part in parts], axis=1)[:, keep].reshape(4, -1)
-        colors[shows] = encoded(light[:, shows].T)[:, :colors.shape[1]]
+        colors[shows] = straight(light[:, shows].T)[:, :colors.shape[1]]
     surface = quantized(corner, axes[:, 0] * spacing, axes[:, 1] * spacing, height.ravel(), request.nodes, colors,
                         request.precise, origin=points.origin, diagonal=points.diagonal, oriented=points.oriented)
     first, missed = (part.regions.label for part in parts)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..device import Device
 from ..errors import InputError
 from ..io.cleaning import first_of_duplicates
+from ..surface.srgb import premultiplied
 from .neighbours import BoxTree, box_tree, nearest, sampled_covariance
 from .point_tree import PointTree, build_point_tree
 from .radius import robust_box
@@ -76,7 +77,7 @@ def sheet_points(scan, device: Device) -> SheetPoints:
     points = usable_points(scan, None, device)
     position, normals = points.position, points.normals
     first, target = first_of_duplicates(position)
-    colors = None if points.colors is None else linear_light(points.colors)
+    colors = None if points.colors is None else premultiplied(points.colors)
     if len(first) < len(position):
         mean = lambda values: means(values, target, len(first))  # noqa: E731
         position, normals = position[first], _unit_or(mean(normals), normals[first])
@@ -141,19 +142,3 @@ def agreement(position: NDArray, normals: NDArray, neighbours: NDArray) -> float
     off = np.abs(np.einsum("ik,ijk->ij", normals[rows], edge)) < 0.5 * np.linalg.norm(edge, axis=2)
     clear = (near >= 0) & off & (np.abs(dot) > 0.5)
     return float((dot > 0)[clear].mean()) if clear.any() else 1.0
-
-
-def linear_light(colors: NDArray) -> NDArray:
-    """Return (n, 4) float32 linear light, premultiplied by alpha, of (n, 4) uint8 sRGB."""
-    value = np.arange(256) / 255.0
-    table = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    alpha = colors[:, 3:] / np.float32(255)
-    return np.concatenate([table[colors[:, :3]] * alpha, alpha], axis=1)
-
-
-def encoded(light: NDArray) -> NDArray:
-    """Return (n, 4) uint8 sRGB with straight alpha of linear light premultiplied by alpha, (n, 4)."""
-    alpha = np.clip(light[:, 3:], 0, 1)
-    straight = np.clip(np.divide(light[:, :3], alpha, out=np.zeros_like(light[:, :3]), where=alpha > 0), 0, 1)
-    value = np.where(straight <= 0.0031308, 12.92 * straight, 1.055 * straight ** (1 / 2.4) - 0.055)
-    return np.round(255 * np.concatenate([value, alpha], axis=1)).astype(np.uint8)

@@ -14,8 +14,9 @@ from scipy import ndimage
 from ..device import Device
 from ..errors import InputError
 from ..surface.patch import PatchSurface
+from ..surface.srgb import straight
 from .patch_local import BOUND_SHARE, FINEST, SPACING, distances, in_whole_cells, nothing_shows
-from .patch_points import SheetPoints, encoded, sheet_points
+from .patch_points import SheetPoints, sheet_points
 from .patch_search import searched
 from .quantize import quantized
 from .radius import robust_box
@@ -103,7 +104,7 @@ def patches_at(points: SheetPoints, spacing: float, request, step) -> tuple[Patc
     light = None if points.light is None else np.concatenate([part[3] for part in parts])
     colors = None
     if light is not None:
-        colors = encoded(light.reshape(-1, 4))
+        colors = straight(light.reshape(-1, 4))
         colors = colors if request.precise else colors[:, :3]
     surface = quantized(corner * points.diagonal + points.middle, axes[:, 0] * spacing, axes[:, 1] * spacing,
                         height.ravel() * points.diagonal, request.nodes, colors, request.precise, origin=points.origin,

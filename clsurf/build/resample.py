@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from ..surface.mesh import Mesh
+from ..surface.srgb import LINEAR_OF_BYTE
 
 VERTEX_COLORS, FACE_COLORS, TEXTURE = 1, 2, 3  # SOURCE of resample_colors.cl
 REACH = 1.25  # node steps, see resample_heights.cl
@@ -102,7 +103,7 @@ def resample_faces(device, mesh: Mesh, frames: Frames, lists: FaceLists, precise
         out = device.empty((nodes, 4), np.uint8)
         device.kernel("build/resample_colors.cl", constants={"SOURCE": kind})(
             (count,), (1,), count, packed, size, offset, source, faces, vertices, device.upload(texels), width, height,
-            device.upload(uv), device.upload(_linear_light()), out)
+            device.upload(uv), device.upload(LINEAR_OF_BYTE.astype(np.float32)), out)
     z, found = device.download(heights).astype(np.float64), device.download(source)
     if colors is None:
         return z, None, found
@@ -173,9 +174,3 @@ def rgba_of(colors) -> NDArray:
     out = np.full((len(colors), 4), 255, np.uint8)
     out[:, :colors.shape[1]] = colors
     return out
-
-
-def _linear_light() -> NDArray:
-    """Return the linear light (256,) float32 of the sRGB values."""
-    s = np.arange(256) / 255
-    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4).astype(np.float32)

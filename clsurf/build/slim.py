@@ -22,6 +22,7 @@ from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
 from ..surface.slim import COEFFICIENTS, SlimSurface
+from ..surface.srgb import premultiplied, straight
 from .point_tree import BLOCK, FAR_POINT, PointTree, build_point_tree
 from .project import leaf_tree, project_sorted
 from .radius import LEAST_PENALTY, Noise, automatic_error, measure_noise, robust_box, segment_end
@@ -351,21 +352,12 @@ def surfel_footprints(tree: PointTree, center: NDArray, record: NDArray, terms: 
 def surfel_colors(tree: PointTree, center: NDArray, record: NDArray, colors: NDArray) -> NDArray:
     """Return colours (m, 4) uint8 sRGB with straight alpha: weighted means in premultiplied linear light."""
     device = tree.device
-    value = np.arange(256) / 255.0
-    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
     sorted_colors = np.zeros((4, tree.padded), np.float32)
-    chosen = colors[tree.order]
-    sorted_colors[3, :tree.count] = chosen[:, 3] / np.float32(255)
-    for k in range(3):
-        sorted_colors[k, :tree.count] = linear[chosen[:, k]] * sorted_colors[3, :tree.count]
+    sorted_colors[:, :tree.count] = premultiplied(colors[tree.order]).T
     out = device.empty((len(center), 4), np.float32)
     device.kernel("build/surfel_colors.cl")((len(center),), (1,), len(center), device.upload(center),
                                             device.upload(record), device.upload(sorted_colors), *tree.arguments, out)
-    mean = device.download(out).astype(np.float64)
-    alpha = np.clip(mean[:, 3:], 0, 1)
-    light = np.clip(np.divide(mean[:, :3], alpha, out=np.zeros_like(mean[:, :3]), where=alpha > 0), 0, 1)
-    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return np.round(255 * np.concatenate([encoded, alpha], axis=1)).astype(np.uint8)
+    return straight(device.download(out).astype(np.float64))
 
 
 def with_bound(surface: SlimSurface, tree: PointTree, middle: NDArray) -> SlimSurface:

@@ -8,6 +8,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsurf.errors import FileFormatError, InputError
+from clsurf.surface.srgb import LINEAR_OF_BYTE, to_srgb
 
 from .files import existing_file, one_line, replacing
 
@@ -47,7 +48,7 @@ def to_srgb8(color, background=None) -> NDArray:
     elif (alpha < 1).any():
         rgb = np.divide(rgb, alpha, out=np.zeros_like(rgb), where=alpha > 0)
     out = np.empty((*color.shape[:2], 4), np.uint8)
-    out[..., :3] = _eight_bit(_srgb(rgb))
+    out[..., :3] = _eight_bit(to_srgb(rgb))
     out[..., 3:] = _eight_bit(alpha)
     return out
 
@@ -55,8 +56,7 @@ def to_srgb8(color, background=None) -> NDArray:
 def from_srgb8(pixels) -> NDArray:
     """Convert (..., 3 or 4) uint8 sRGB with straight alpha to (..., 4) float32 linear premultiplied colour."""
     pixels = np.asarray(pixels, np.uint8)
-    steps = np.arange(256) / 255
-    table = np.where(steps <= 0.04045, steps / 12.92, ((steps + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    table = LINEAR_OF_BYTE.astype(np.float32)
     out = np.ones((*pixels.shape[:-1], 4), np.float32)
     out[..., :3] = table[pixels[..., :3]]
     if pixels.shape[-1] == 4:
@@ -283,11 +283,6 @@ def _known(path) -> Path:
         raise InputError(f"{path}: unknown picture format {path.suffix or '(no ending)'}: expected "
                          f"{', '.join(ENDINGS)}")
     return path
-
-
-def _srgb(linear: NDArray) -> NDArray:
-    linear = np.clip(np.nan_to_num(linear), 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, np.float32(1 / 2.4)) - 0.055)
 
 
 def _eight_bit(value: NDArray) -> NDArray:

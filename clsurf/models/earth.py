@@ -11,6 +11,7 @@ from ..errors import FileFormatError, InputError
 from ..io.files import existing_file
 from ..io.images import read_image
 from ..surface.patch import PatchSurface
+from ..surface.srgb import LINEAR_OF_BYTE, to_linear, to_srgb
 from .continents import continents, tinted
 from .rows import latitude_rows
 from .sphere_map import SphereMap
@@ -149,7 +150,7 @@ def _maps(color, elevation, spacing: float, seed: int) -> tuple[SphereMap, Spher
     else:
         shown = heights.reduced(pixel)
         tints = tinted(SphereMap(shown.values / max(float(shown.values.max()), 1e-9)), seed)
-        colors = SphereMap(_linear(tints.values))
+        colors = SphereMap(to_linear(tints.values).astype(np.float32))
     land = np.maximum(heights.values, 0)
     return colors, SphereMap(land / max(float(land.max()), 1e-9)).reduced(pixel)
 
@@ -159,7 +160,7 @@ def heights_by_color(colors: SphereMap) -> SphereMap:
 
     Ice, which the paper does not speak of, is taken for a plateau. Smooth the result.
     """
-    red, green, blue = np.moveaxis(_encoded(colors.values), -1, 0)
+    red, green, blue = np.moveaxis(to_srgb(colors.values), -1, 0)
     bright = np.maximum(np.maximum(red, green), np.maximum(blue, 1e-6))
     sea = (blue - np.maximum(red, green)) > 0.12 * bright
     sea |= bright < 0.02
@@ -182,7 +183,7 @@ def _color_map(color) -> SphereMap:
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] < 3 or min(pixels.shape[:2]) < 2:
         raise InputError(f"color: expected a picture (h, w, 3) uint8 of the whole sphere, got {pixels.dtype} "
                          f"{pixels.shape}")
-    table = _linear(np.arange(256, dtype=np.float32) / 255)
+    table = LINEAR_OF_BYTE.astype(np.float32)
     return SphereMap(table[pixels[..., :3]])
 
 
@@ -256,14 +257,5 @@ def _read_numbers(path: Path) -> NDArray:
         raise FileFormatError(f"{path}: expected rows of numbers, got {error}") from None
 
 
-def _linear(encoded: NDArray) -> NDArray:
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def _encoded(linear: NDArray) -> NDArray:
-    linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
 def _srgb8(linear: NDArray) -> NDArray:
-    return np.rint(255 * _encoded(linear)).astype(np.uint8)
+    return np.rint(255 * to_srgb(linear)).astype(np.uint8)

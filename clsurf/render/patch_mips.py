@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..surface.patch import PatchSurface, opaque_nodes
-from .shade import to_linear
+from ..surface.srgb import LINEAR_OF_BYTE, to_srgb
 
 
 def mip_levels(surface: PatchSurface, most: int = 8) -> list[PatchSurface]:
@@ -97,7 +97,7 @@ def _averaged(surface, nodes, m, n):
     opaque = opaque_nodes(d, colors)
     parts = [d.astype(np.float64)]
     if colors is not None:
-        linear = to_linear(np.arange(256) / 255)[colors[:, :3]]
+        linear = LINEAR_OF_BYTE[colors[:, :3]]
         alpha = colors[:, 3:] / 255
         parts += [*(linear * alpha if alpha.size else linear).T, *alpha.T]
     across, along = tent(int(m)), tent(int(n))
@@ -112,9 +112,7 @@ def _encoded(linear, opaque):
     if linear.shape[1] == 4:
         linear = linear.copy()
         linear[:, :3] /= np.maximum(linear[:, 3:], 1e-9)
-    rgb = np.clip(linear[:, :3], 0, 1)
-    srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
-    out = np.rint(255 * np.concatenate([srgb, linear[:, 3:]], axis=1)).astype(np.uint8)
+    out = np.rint(255 * np.concatenate([to_srgb(linear[:, :3]), linear[:, 3:]], axis=1)).astype(np.uint8)
     if out.shape[1] == 4:
         out[:, 3] = np.maximum(out[:, 3], 1)
     else:

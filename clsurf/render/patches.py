@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
+from ..surface.srgb import LINEAR_OF_BYTE, to_linear
 from .patch_drawing import PatchDrawing
 from .patch_forms import cull_patches, mark_levels, select_levels, surface_form
 from .patch_lattice import CELLS
 from .patch_nodes import LIT_UNIT, light_nodes, table_normals
 from .patch_tiles import NODES, PAD, tile_patches
-from .shade import Look, Shading, new_channels, shade_constants, to_linear
+from .shade import Look, Shading, new_channels, shade_constants
 from .tiles import Grid, Scratch, view_floats
 
 FRAME_FLOATS, PATCH_FLOATS = 16, 24  # kernels/common/patch.clh
@@ -113,7 +114,7 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
         (p,), None, frames, sizes, offsets, p, colors, heights, cells, borders, slopes)
     largest = float(device.download(borders, copy=False)[:nodes].max(initial=0.0)) if nodes else 0.0
     color = None if surface.color is None else to_linear(surface.color / 255)
-    linear = device.upload(to_linear(np.arange(256) / 255).astype(np.float32))
+    linear = device.upload(LINEAR_OF_BYTE.astype(np.float32))
     steps, rims = device.zeros(nodes + PAD, np.float32), device.zeros(nodes + PAD, np.uint16)
     packed = device.zeros((nodes + PAD, 4), np.uint32)
     device.kernel("render/pack_patches.cl", constants={"CHANNELS": channels, "PRECISE": precise})(

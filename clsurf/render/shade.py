@@ -6,6 +6,7 @@ import numpy as np
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from ..surface.srgb import to_linear
 from .patch_drawing import PatchDrawing
 from .tiles import BIN, Grid, Scratch
 
@@ -101,12 +102,6 @@ class Look:
     patches: PatchDrawing
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
-
-
-def to_linear(srgb):
-    """Return linear light of sRGB values in 0 to 1."""
-    srgb = np.asarray(srgb, np.float64)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:

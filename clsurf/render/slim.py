@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.slim import SlimSurface
-from .shade import Look, Shading, to_linear
+from ..surface.srgb import LINEAR_OF_BYTE, to_linear
+from .shade import Look, Shading
 from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, new_footprints, view_floats
 
 RECORD_FLOATS = 32  # kernels/common/slim.clh
@@ -150,7 +151,7 @@ def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
     colors = None
     if surface.colors is not None:
         colors = np.ones((n, 4), np.float32)
-        colors[:, :3] = to_linear(np.arange(256) / 255)[surface.colors[order, :3]]
+        colors[:, :3] = LINEAR_OF_BYTE[surface.colors[order, :3]]
     use = usable if usable.any() else np.zeros(n, bool)
     points = centers[use].astype(np.float64)
     center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
