@@ -73,19 +73,6 @@ def parsed_size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def parsed_error(text: str) -> float | str:
-    """Return T_MDL as a number, or 'auto'."""
-    if text == "auto":
-        return text
-    try:
-        value = float(text)
-        if not 0 < value < 1:
-            raise ValueError
-    except ValueError:
-        raise InputError(f"error: expected a number between 0 and 1 such as 0.01, or auto, got {text!r}") from None
-    return value
-
-
 def parsed_vector(name: str, text: str) -> tuple[float, float, float]:
     """Return three numbers of a text such as 1,0.5,2."""
     try:
