@@ -113,6 +113,14 @@ def assembled(points: SheetPoints, parts: list[Patches], spacing: float, request
     first, missed = (part.regions.label for part in parts)
     number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)
     patch = number[np.where(missed >= 0, missed + len(parts[0].regions), first)]
+    return with_bound(surface, points, patch)
+
+
+def with_bound(surface: PatchSurface, points: SheetPoints, patch: NDArray) -> tuple[PatchSurface, float]:
+    """Return `surface` with the distance that BOUND_SHARE of the points keep, and their root mean square error.
+
+    `patch` (n,) int is the number of the patch that shows each point, -1 for none; see `distances`.
+    """
     distance = distances(surface, points, patch)
     bound = float(np.quantile(distance, BOUND_SHARE, method="higher"))
     near = distance[distance <= bound]  # strays say nothing about the fit

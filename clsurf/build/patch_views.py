@@ -5,7 +5,7 @@ one or two pixels are filled from their neighbours, never across a jump of depth
 which no earlier view did become patches. What no view sees stays out: local range images (patch_local) cover more.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from ..device import Device
 from ..errors import InputError
 from ..surface.patch import PatchSurface
 from ..surface.srgb import straight
-from .patch_local import BOUND_SHARE, FINEST, SPACING, distances, in_whole_cells, nothing_shows
+from .patch_local import FINEST, SPACING, in_whole_cells, nothing_shows, with_bound
 from .patch_points import SheetPoints, sheet_points
 from .patch_search import searched
 from .quantize import quantized
@@ -109,10 +109,7 @@ def patches_at(points: SheetPoints, spacing: float, request, step) -> tuple[Patc
     surface = quantized(corner * points.diagonal + points.middle, axes[:, 0] * spacing, axes[:, 1] * spacing,
                         height.ravel() * points.diagonal, request.nodes, colors, request.precise, origin=points.origin,
                         diagonal=points.diagonal, oriented=points.oriented)
-    distance = distances(surface, points, patch)
-    bound = float(np.quantile(distance, BOUND_SHARE, method="higher"))
-    near = distance[distance <= bound]
-    return replace(surface, bound=bound, bound_share=BOUND_SHARE), float(np.sqrt(np.mean(near**2)))
+    return with_bound(surface, points, patch)
 
 
 def range_image(points: SheetPoints, direction: NDArray, box: NDArray, gap: float) -> View:
