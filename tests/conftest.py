@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from clsurf.device import open_device
+from clsurf.render.renderer import Renderer
 
 _without_data: list[str] = []
 
@@ -21,6 +22,13 @@ def _own_caches(tmp_path_factory):
 def device():
     """The device under test: CLSURF_DEVICE, else PoCL. No device is a failure, not a skip."""
     return open_device(os.environ.get("CLSURF_DEVICE") or "pocl")
+
+
+@pytest.fixture(scope="module")
+def renderers(device):
+    """Renderers in both kernel forms, and one of small tiles."""
+    with Renderer(device, lanes=16) as lanes, Renderer(device, lanes=1) as items, Renderer(device, tile=8) as small:
+        yield lanes, items, small
 
 
 def data_folder() -> Path:

@@ -1,194 +1,23 @@
-"""The further modes of the patch renderer: table of normals, mip levels, subdivision, light at the nodes, alpha."""
+"""The further modes of the patch renderer: subdivision, light at the nodes, alpha."""
 
 import itertools
 
 import numpy as np
 import pytest
 from reference import render_patch_modes as twin
+from reference.patch_scenes import CAMERAS, FRONT, SIZE, disc, joined, rough, sheet, wavy
 from reference.surfaces import sphere
 from scipy import ndimage
-from test_surface_patch import bowls
 
-from clsurf.build.quantize import quantized
-from clsurf.errors import InputError
 from clsurf.render.camera import Camera
-from clsurf.render.normal_table import half_steps, normal_statistics, ratio_groups
 from clsurf.render.patch_alpha import extended
 from clsurf.render.patch_drawing import PatchDrawing
-from clsurf.render.patch_forms import cull_patches
-from clsurf.render.patch_mips import halved, mip_levels, tent
-from clsurf.render.patch_nodes import LIT_RANGE, light_nodes, table_normals
+from clsurf.render.patch_nodes import LIT_RANGE, light_nodes
 from clsurf.render.patches import patch_constants, place_patches, project_patches, upload_patches
-from clsurf.render.renderer import Renderer
 from clsurf.render.scene import Scene
 from clsurf.render.shade import Light, Shading, shading_floats
+from clsurf.render.tiles import Scratch
 from clsurf.surface.srgb import to_linear
-from clsurf.render.tiles import Scratch, view_floats
-from clsurf.surface.patch import PatchSurface
-
-# Patches to draw ------------------------------------------------------------------------------------------------------
-
-
-def joined(*surfaces):
-    """One surface of the patches of several."""
-    names = ("origins", "axis_x", "axis_y", "axis_z_length", "size", "displacements")
-    arrays = [np.concatenate([getattr(s, name) for s in surfaces]) for name in names]
-    colors = None if surfaces[0].colors is None else np.concatenate([s.colors for s in surfaces])
-    return PatchSurface(*arrays, colors, origin=surfaces[0].origin)
-
-
-def rough(count=6, size=(9, 7), seed=3, ratios=(1.0, 0.5), holes=0.1, colors=False):
-    """Patches of random heights over random frames, with transparent nodes; their |a_z| / |a_x| varies."""
-    rng = np.random.default_rng(seed)
-    frames = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
-    frames[:, 2] *= np.sign(np.linalg.det(frames))[:, None]
-    d = rng.integers(-100, 128, count * size[0] * size[1]).astype(np.int8)
-    hole = rng.random(len(d)) < holes
-    rgb = rng.integers(1, 255, (len(d), 3)).astype(np.uint8) if colors else None
-    if colors:
-        rgb[hole] = 0
-    else:
-        d[hole] = -128
-    step = 0.01 * np.asarray(ratios)[np.arange(count) % len(ratios)]
-    return PatchSurface(rng.normal(size=(count, 3)), frames[:, 0], frames[:, 1] * 0.5, step, size, d, rgb)
-
-
-# The table of normals -------------------------------------------------------------------------------------------------
-
-
-def test_half_steps():
-    surface = rough()
-    for part in (surface, joined(surface, rough(2, (5, 12)))):
-        got = np.stack(half_steps(part), axis=1)
-        for k in range(len(part)):
-            (m, n), (a, b) = part.size[k], part.node_offset[k:k + 2]
-            opaque = part.opaque[a:b].reshape(n, m)
-            wanted = 2 * twin.slopes(part.displacements[a:b].reshape(n, m), opaque)
-            assert (got[a:b].reshape(n, m, 2)[opaque] == wanted[opaque]).all()
-
-
-@pytest.mark.parametrize("ratios", [(1.0,), (1.0, 0.5), (1.0, 0.5, 0.25)])
-def test_normal_statistics_count_what_a_table_would(ratios):
-    surface = rough(6, ratios=ratios)
-    got = normal_statistics(surface)
-    wanted = twin.table_counts(surface)
-    assert (got.normals, got.buffered, got.ordered) == wanted
-    assert got.groups == len(ratios) and got.ordered <= got.buffered <= got.normals
-    assert got.precomputed < got.ordered if len(ratios) == 1 else got.precomputed == got.ordered
-    assert normal_statistics(surface, np.zeros(6, bool)).normals == 0
-    one = np.arange(6) == 2
-    assert normal_statistics(surface, one).buffered == normal_statistics(surface, one).ordered
-
-
-def test_equal_patches_share_all_their_normals():
-    one = rough(1)
-    many = joined(*[one] * 5)
-    five, alone = normal_statistics(many), normal_statistics(one)
-    assert five.buffered - five.precomputed == alone.buffered - alone.precomputed < alone.normals
-    assert five.normals == 5 * alone.normals and five.precomputed == 5 * alone.precomputed
-
-
-def test_ratio_groups():
-    surface = rough(6, ratios=(1.0, 0.5, 0.25))
-    group, ratios = ratio_groups(surface)
-    assert len(ratios) == 3 and (np.bincount(group) == 2).all()
-    own = surface.axis_z_length / np.linalg.norm(surface.axis_x, axis=1)
-    assert np.abs(ratios[group, 0] / own - 1).max() < 4e-4
-
-
-# Mip levels -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("nodes", (2, 3, 4, 5, 6, 7, 9, 16, 17))
-def test_coarser_rows_keep_ends_and_straight_lines(nodes):
-    weights = tent(nodes)
-    assert weights.shape == ((nodes + 2) // 2, nodes)
-    assert np.allclose(weights.sum(axis=1), 1) and weights[0, 0] == weights[-1, -1] == 1
-    step = (nodes - 1) / (len(weights) - 1)
-    assert np.allclose(weights @ np.arange(nodes), np.arange(len(weights)) * step)
-
-
-@pytest.mark.parametrize("size", [(17, 9), (6, 8), (5, 2)])
-def test_levels_keep_the_outline(size):
-    """Corners stay where they are, border nodes on the border, and a plane stays that plane."""
-    rng = np.random.default_rng(1)
-    i, j = np.tile(np.arange(size[0]), size[1]), np.repeat(np.arange(size[1]), size[0])
-    frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    surface = quantized(np.zeros((1, 3)), frame[:1] * 0.5, frame[1:2] * 0.25, 0.2 * i - 0.1 * j, size, precise=True)
-    levels = mip_levels(surface)
-    assert (levels[-1].size == 2).all()
-    fine = surface.positions().reshape(size[1], size[0], 3)
-    normal = np.cross(fine[0, -1] - fine[0, 0], fine[-1, 0] - fine[0, 0])
-    normal /= np.linalg.norm(normal)
-    for level in levels[1:]:
-        nodes = level.positions().reshape(level.size[0, 1], level.size[0, 0], 3)
-        for a, b in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
-            assert np.abs(nodes[a, b] - fine[a, b]).max() < 2e-6
-        assert np.abs((nodes - fine[0, 0]) @ normal).max() < 2e-5
-
-
-def test_levels_average_linear_light_and_keep_most_of_what_shows():
-    rng = np.random.default_rng(5)
-    colors = np.where(rng.random((81, 1)) < 0.5, [[255, 255, 255]], [[1, 1, 1]])
-    flat = PatchSurface(np.zeros((1, 3)), [[1, 0, 0]], [[0, 1, 0]], [0.1], (9, 9), np.zeros(81, np.int8), colors)
-    level = halved(flat)
-    inner = to_linear(level.colors.reshape(5, 5, 3)[1:-1, 1:-1] / 255)
-    kernel = np.outer([1, 2, 1], [1, 2, 1]) / 16
-    linear = to_linear(colors.reshape(9, 9, 3) / 255)
-    wanted = [[(linear[j - 1:j + 2, i - 1:i + 2] * kernel[..., None]).sum(axis=(0, 1)) for i in (2, 4, 6)]
-              for j in (2, 4, 6)]
-    assert np.abs(inner - wanted).max() < 0.006  # 8 bits of sRGB
-    surface = rough(20, (17, 17), holes=0.3)
-    shares = [s.opaque.mean() for s in mip_levels(surface)[:3]]
-    assert shares[1] > shares[0] and (halved(rough(3, holes=1.0)).opaque == 0).all()
-
-
-def test_levels_of_all_kinds():
-    for surface in (bowls(2, colors=True)[0], bowls(2, precise=True)[0], bowls(2, colors=True, precise=True)[0],
-                    joined(rough(2), rough(1, (4, 11)))):
-        levels = mip_levels(surface)
-        assert all(len(s) == len(surface) for s in levels) and (levels[-1].size == 2).all()
-        low, high = surface.bounds
-        reach = 1e-3 * np.ptp(surface.bounds, axis=0) + np.linalg.norm(surface.axis_z, axis=1).max()
-        for level in levels:
-            assert (level.bounds[0] >= low - reach).all() and (level.bounds[1] <= high + reach).all()
-    mixed = joined(rough(2), rough(1, (4, 11)))
-    assert np.array_equal(halved(mixed).displacements[:2 * 5 * 4], halved(rough(2)).displacements)
-
-
-# Drawing --------------------------------------------------------------------------------------------------------------
-
-SIZE = (61, 47)
-FRONT = Camera.orthographic((0, 0, 5), (0, 0, 0), height=2.2)
-
-
-def sheet(height, nodes=(9, 9), spacing=0.25, precise=True, colors=None, center=(0.0, 0.0)):
-    """One patch over the xy plane, facing +z, of heights `height(x, y)`, and its nodes' x and y."""
-    m, n = nodes
-    x = (np.tile(np.arange(m), n) - (m - 1) / 2) * spacing + center[0]
-    y = (np.repeat(np.arange(n), m) - (n - 1) / 2) * spacing + center[1]
-    origin = np.array([[x[0], y[0], 0]])
-    return quantized(origin, np.array([[spacing, 0, 0]]), np.array([[0, spacing, 0]]), height(x, y), nodes, colors,
-                     precise), x, y
-
-
-def wavy(x, y):
-    return 0.12 * np.sin(5 * x) * np.cos(4 * y) + 0.1 * x
-
-
-def steps(surface, places):
-    """Places (q, 2) in nodes to the surface's own x and y."""
-    return surface.origins[0, :2] + places * [surface.axis_x[0, 0], surface.axis_y[0, 1]]
-
-
-@pytest.fixture(scope="module")
-def renderers(device):
-    with Renderer(device, lanes=16) as lanes, Renderer(device, lanes=1) as items, Renderer(device, tile=8) as small:
-        yield lanes, items, small
-
-
-CAMERAS = {"orthographic": Camera.orthographic((2, 3, 7), (0, 0, 0), height=2.6),
-           "perspective": Camera.look_at((1.6, 3.0, 4.8), (0, 0, 0), fov=24)}
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
@@ -358,62 +187,7 @@ def test_gouraud_beside_other_surfaces(renderers):
     assert np.array_equal(*unlit)
 
 
-# The table on a device ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mode", [True, "ordered", "precomputed"])
-@pytest.mark.parametrize("colors", [False, True])
-def test_table_normals(device, mode, colors):
-    """The table gives the normals that it saves computing, and computes as many as the statistics say."""
-    ratios = (1.0,) if mode == "precomputed" else (1.0, 0.5, 0.25)
-    surface = rough(9, ratios=ratios, colors=colors)
-    upload, scratch = upload_patches(device, surface), Scratch(device, 16)
-    view = device.upload(place_patches(upload, None, Camera.framing(surface, margin=1.3), (200, 200), Shading()))
-    rectangles = project_patches(device, scratch, upload, view, PatchDrawing()).rectangles
-    seen = device.download(rectangles)[:, 0] <= device.download(rectangles)[:, 2]
-    got, counts = table_normals(device, scratch, upload, patch_constants(upload), rectangles, mode, parts=1)
-    statistics = normal_statistics(surface, seen)
-    name = {True: "buffered"}.get(mode, mode)
-    assert device.download(counts).tolist() == [[statistics.normals, getattr(statistics, name)]]
-    packed = device.download(got)[:, 3].astype(np.int64)
-    got = np.stack([(packed << 16).astype(np.int32) >> 16, packed.astype(np.int32) >> 16], axis=1) / 2
-    for k in np.flatnonzero(seen):
-        (m, n), (a, b) = surface.size[k], surface.node_offset[k:k + 2]
-        opaque = surface.opaque[a:b].reshape(n, m)
-        rx, ry = (surface.axis_z_length[k] / np.linalg.norm(axis[k]) for axis in (surface.axis_x, surface.axis_y))
-        wanted = twin.table_normals(surface.displacements[a:b].reshape(n, m), opaque, rx, ry)[opaque]
-        normal = np.concatenate([-got[a:b] * [rx, ry], np.ones((b - a, 1))], axis=1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        assert np.abs(normal[opaque.ravel()] - wanted).max() < 3e-4  # 16 bits, and groups of ratios within 0.034 %
-
-
-def test_pictures_with_a_table_are_the_same(renderers):
-    surface = rough(30, holes=0.05, ratios=(1.0, 0.5))
-    camera = Camera.framing(surface)
-    for cells in ("quads", "bilinear"):
-        plain = renderers[0].render(surface, camera, SIZE, patches=PatchDrawing(cells=cells))
-        for mode in (True, "ordered"):
-            for r in renderers[:2]:
-                frame = r.render(surface, camera, SIZE, patches=PatchDrawing(cells=cells, normal_table=mode))
-                assert np.array_equal(frame.depth, plain.depth, equal_nan=True)
-                assert np.nanmax(np.abs(frame.normal - plain.normal)) < 2e-3
-
-
-def test_the_table_wants_what_it_can_hold(renderers):
-    with pytest.raises(InputError, match="ordered"):
-        renderers[0].render(rough(4), None, SIZE, patches=PatchDrawing(normal_table="precomputed"))
-    with pytest.raises(InputError, match="8-bit"):
-        renderers[0].render(sheet(wavy)[0], None, SIZE, patches=PatchDrawing(normal_table=True))
-
-
 # Alpha ----------------------------------------------------------------------------------------------------------------
-
-
-def disc(nodes, radius=0.9, colors=None, tilt=0.2):
-    """A tilted disc in one patch of side 2.2; nodes outside are transparent."""
-    spacing = 2.2 / (nodes - 1)
-    return sheet(lambda x, y: np.where(np.hypot(x, y) <= radius, tilt * x, np.nan), (nodes, nodes), spacing,
-                 colors=colors)[0]
 
 
 def test_carried_on_nodes_continue_a_plane():
@@ -469,92 +243,3 @@ def test_alpha_with_supersampling_gives_smooth_edges(renderers):
     cover = frame.color[..., 3]
     assert ((cover > 0.1) & (cover < 0.9)).sum() > 60
     assert abs(cover.mean() * 2.2 ** 2 / (np.pi * 0.81) - 1) < 0.02
-
-
-# Minification and back faces ------------------------------------------------------------------------------------------
-
-
-def globe(count=60, bump=0.0, checks=0):
-    """A bumpy unit sphere of 17 x 17 patches, with a fine chequer of colours."""
-    k = np.arange(count) + 0.5
-    z, angle = 1 - 2 * k / count, np.pi * (1 + 5 ** 0.5) * k
-    normal = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
-    x = np.cross(np.where(np.abs(normal[:, 2:]) < 0.9, [[0, 0, 1.0]], [[1.0, 0, 0]]), normal)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    y, step = np.cross(normal, x), 1.6 * np.sqrt(4 * np.pi / count) / 16
-    u, v = (np.tile(np.arange(17), 17) - 8) * step, (np.repeat(np.arange(17), 17) - 8) * step
-    height = np.sqrt(1 - u * u - v * v) - 1 + 0 * k[:, None]
-    p = normal[:, None] * (1 + height[..., None]) + u[:, None] * x[:, None] + v[:, None] * y[:, None]
-    height = height + bump * np.sin(9 * p[..., 0]) * np.sin(8 * p[..., 1])
-    check = np.floor(p * checks).sum(axis=2) % 2 if checks else np.zeros(p.shape[:2])
-    colors = np.repeat((255 - 250 * check).reshape(-1, 1), 3, axis=1)
-    return quantized(normal - 8 * step * (x + y), x * step, y * step, height.ravel(), (17, 17), colors)
-
-
-@pytest.mark.parametrize("distance", [4.0, 12.0, 40.0, 150.0])
-def test_select_levels(renderers, distance):
-    """The channel "level" says the levels that the twin chooses, and both forms draw the same."""
-    surface = globe()
-    camera = Camera.look_at((0, distance * 0.6, distance * 0.8), (0.3, 0, 0), fov=40)
-    a, b, c = (r.render(surface, camera, SIZE, ("color", "depth", "level")) for r in renderers)
-    for other in (b, c):
-        assert all(np.array_equal(a.channels[n], other.channels[n], equal_nan=n != "level") for n in a.channels)
-    view = view_floats(camera, SIZE, camera.rotation, camera.rotation @ (surface.origin - camera.eye))
-    wanted = twin.select_levels(view, mip_levels(surface))
-    shown = a.level[np.isfinite(a.depth)]
-    assert set(np.unique(shown)) <= set(wanted) and len(shown) > 0
-    assert abs(np.median(shown) - np.median(wanted)) <= 1
-    plain = renderers[0].render(surface, camera, SIZE, ("level",), patches=PatchDrawing(mip=False))
-    assert set(np.unique(plain.level)) <= {-1, 0}
-
-
-def test_levels_leave_no_cracks(renderers):
-    """Patches of different levels beside each other still cover the sphere, and lie on it."""
-    surface = globe(120)
-    for distance in (9.0, 12.0, 16.0, 24.0):
-        camera = Camera.look_at((0, 0, distance), (0, 0, 0), fov=30)
-        frame = renderers[0].render(surface, camera, (90, 90), ("depth", "level"))
-        shown = np.isfinite(frame.depth)
-        assert (ndimage.binary_fill_holes(shown) == shown).all()
-    levels = set(np.unique(frame.level)) - {-1}
-    assert max(levels) >= 1
-
-
-def test_levels_alias_less(renderers):
-    """Against a picture of 16 x 16 samples a pixel, a far chequered sphere is at least a third closer with levels."""
-    surface = globe(60, checks=40)
-    for distance in (20.0, 45.0):
-        camera = Camera.look_at((0, 0.5 * distance, distance), (0, 0, 0), fov=20)
-        fine = renderers[0].render(surface, camera, (160 * 4, 160 * 4), ("color",), "flat", supersampling=4,
-                                   patches=PatchDrawing(mip=False)).color
-        wanted = fine.reshape(40, 16, 40, 16, 4).mean(axis=(1, 3))
-        error = [np.sqrt(np.mean((renderers[0].render(surface, camera, (40, 40), ("color",), "flat",
-                                                      patches=PatchDrawing(mip=m)).color - wanted) ** 2))
-                 for m in (True, False)]
-        assert error[0] < 0.67 * error[1]
-
-
-@pytest.mark.parametrize("camera", [Camera.look_at((0, 2, 3), (0, 0, 0)),
-                                    Camera.look_at((0, 0.3, 1.4), (0, 0, 0), fov=90),
-                                    Camera.look_at((0, 20, 30), (0, 0, 0), fov=8),
-                                    Camera.orthographic((1, 2, 3), (0, 0, 0), height=2.3)])
-@pytest.mark.parametrize("bump", [0.0, 0.05])
-def test_cull_patches(device, camera, bump):
-    """Only patches that show nothing but backs are left out, most of those are, and a closed surface looks the same."""
-    surface = globe(60, bump)
-    with Renderer(device) as r:
-        frames = [r.render(surface, camera, SIZE, ("depth", "normal"), patches=PatchDrawing(cull=cull, mip=False))
-                  for cull in (False, True)]
-    for name, array in frames[0].channels.items():
-        assert np.array_equal(array, frames[1].channels[name], equal_nan=True)
-    upload, scratch = upload_patches(device, surface), Scratch(device, 16)
-    view = device.upload(place_patches(upload, None, camera, SIZE, Shading()))
-    projected = project_patches(device, scratch, upload, view, PatchDrawing())
-    before = device.download(projected.rectangles)
-    cull_patches(device, upload, upload, 1, None, view, projected)
-    after = device.download(projected.rectangles)
-    removed = (before[:, 0] <= before[:, 2]) & (after[:, 0] > after[:, 2])
-    if camera.fov is not None:
-        behind = twin.seen_from_behind(surface, camera.eye)
-        assert behind[removed].all() and removed.sum() > 0.3 * (behind & (before[:, 0] <= before[:, 2])).sum()
-    assert removed.sum() > 5
