@@ -2,53 +2,24 @@
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from clsurf.build.point_tree import build_point_tree
 from clsurf.build.project import project
 from clsurf.build.radius import Noise
-from clsurf.build.slim import Points, assemble, build_levels, build_slim, check_room, face_normals, parse_bytes
-from clsurf.errors import Cancelled, DeviceMemoryError, InputError
-from clsurf.io import load, save
+from clsurf.build.slim import Points, assemble, build_levels, build_slim, face_normals
+from clsurf.errors import Cancelled, InputError
+from clsurf.io import load
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 from clsurf.surface.slim import SlimSurface
 from tests.conftest import scan_path
 from tests.reference import build as twin
+from tests.reference.scans import cloud_of, ellipsoid, torus
 
 
 def silent(stage, done):
     pass
-
-
-def torus(count, seed=0, tube=0.4):
-    """Points and unit normals (n, 3) float64 of a torus of radius 1, about `count` on a jittered even grid."""
-    rng = np.random.default_rng(seed)
-    around = int(np.sqrt(count / tube))
-    across = count // around
-    a, b = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
-    a, b = ((g + rng.uniform(-0.2, 0.2, g.shape)).ravel() for g in (a, b))
-    a, b = a * 2 * np.pi / around, b * 2 * np.pi / across
-    n = np.stack([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)], axis=1)
-    ring = np.stack([np.cos(a), np.sin(a), np.zeros_like(a)], axis=1)
-    return ring + tube * n, n
-
-
-def ellipsoid(count, seed=0):
-    """Points and unit normals (n, 3) float64 of an ellipsoid of half axes 1, 0.7, 0.8, on a Fibonacci spiral."""
-    i = np.arange(count) + 0.5 + 0.2 * np.random.default_rng(seed).uniform(-1, 1, count)
-    z, angle = 1 - 2 * i / (count + 0.5), i * np.pi * (3 - np.sqrt(5))
-    unit = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
-    axes = np.array([1, 0.7, 0.8])
-    n = unit / axes
-    return unit * axes, n / np.linalg.norm(n, axis=1, keepdims=True)
-
-
-def cloud_of(shape, count):
-    points, normals = shape(count)
-    return PointCloud(points, normals=normals)
 
 
 def fixed_radius_surface(points, normals, degree, spacings, device):
@@ -313,47 +284,6 @@ def test_weights(device):
         build_slim(scan, weight=[1.0, 2.0], device=device)
 
 
-@pytest.mark.parametrize(("option", "message"), ((dict(degree=4), "degree: expected 1, 2 or 3"),
-                                                 (dict(error=0), "error: expected a share"),
-                                                 (dict(error="fine"), "error: expected a share"),
-                                                 (dict(memory_limit="lots"), "memory_limit: expected bytes")))
-def test_refuses_options(device, option, message):
-    with pytest.raises(InputError, match=message):
-        build_slim(cloud_of(ellipsoid, 500), device=device, **option)
-
-
-def test_memory_limit(device):
-    assert parse_bytes("2GB") == 2e9 and parse_bytes("1.5 MB") == 1.5e6 and parse_bytes(1000) == 1000
-    with pytest.raises(DeviceMemoryError, match="memory_limit: the build of 500 points needs"):
-        build_slim(cloud_of(ellipsoid, 500), memory_limit="1MB", device=device)
-    with pytest.raises(DeviceMemoryError):
-        check_room(device, 10**13, None, Points(None, None, None, None))
-
-
-@pytest.mark.parametrize("points", (np.zeros((0, 3)), np.zeros((1, 3)), np.zeros((30, 3)), np.full((20, 3), np.nan)))
-def test_refuses_scans_without_extent(device, points):
-    with pytest.raises(InputError, match="scan: expected"):
-        build_slim(PointCloud(points, normals=np.tile([0.0, 0, 1], (len(points), 1))), device=device)
-
-
-def test_refuses_other_things(device, tmp_path):
-    with pytest.raises(InputError, match="expected a Mesh, a PointCloud, a RangeScan or the path of a scan, got int"):
-        build_slim(3, device=device)
-    with pytest.raises(InputError):
-        build_slim(tmp_path / "none.ply", device=device)
-    save(build_slim(cloud_of(ellipsoid, 500), device=device), tmp_path / "model.clsurf")
-    with pytest.raises(InputError, match=r"scan: expected .* got SlimSurface"):
-        build_slim(tmp_path / "model.clsurf", device=device)
-
-
-def test_builds_from_a_path(device, tmp_path):
-    scan = cloud_of(ellipsoid, 2000)
-    save(scan, tmp_path / "scan.ply")
-    plain = build_slim(load(tmp_path / "scan.ply"), device=device)
-    for path in (tmp_path / "scan.ply", str(tmp_path / "scan.ply")):
-        assert build_slim(path, device=device).coefficients.tobytes() == plain.coefficients.tobytes()
-
-
 def test_seams_have_whole_normals():
     """A cube whose faces share no vertices: normals at its corners are those of the closed cube."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
@@ -366,47 +296,6 @@ def test_seams_have_whole_normals():
         assert (normals[:24][here] == normals[:24][here][0]).all()
         assert (np.sign(normals[:24][here][0]) == np.sign(corner - 0.5)).all()
     assert (normals[24] == 0).all()  # of no face
-
-
-DEGENERATE = {
-    "collinear": lambda t: np.stack([t, 2 * t, 3 * t], axis=1),
-    "flat": lambda t: np.stack([t, (t * 7.13) % 1, 0 * t], axis=1),
-    "two points": lambda t: np.array([[0, 0, 0], [1e-12, 0, 0]]),
-    "huge": lambda t: 1e9 * np.stack([t, (t * 7.13) % 1, (t * 3.77) % 1], axis=1),
-    "duplicates": lambda t: np.repeat(np.stack([t, (t * 7.13) % 1, 0 * t], axis=1)[:5], 300, axis=0),
-    "outlier": lambda t: np.concatenate([np.stack([t, (t * 7.13) % 1, 0 * t], axis=1), [[1e4, 0, 0]]]),
-    "tiny": lambda t: 1e-25 * np.stack([t, (t * 7.13) % 1, 0 * t], axis=1),
-}
-
-
-@pytest.mark.parametrize("name", DEGENERATE)
-@pytest.mark.parametrize("degree", (1, 2, 3))
-def test_degenerate_scans(device, name, degree):
-    points = DEGENERATE[name](np.linspace(0, 1, 1500))
-    surface = build_slim(PointCloud(points, normals=np.tile([0.0, 0.6, 0.8], (len(points), 1))), degree=degree,
-                         device=device)
-    check_sane(surface)
-    if name == "outlier":
-        assert surface.diagonal < 2
-
-
-def check_sane(surface):
-    for name in ("centers", "radii", "normals", "coefficients", "fit_error"):
-        assert np.isfinite(getattr(surface, name)).all(), name
-    assert surface.leaf.any() and np.isfinite(surface.bound)
-
-
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.tuples(*3 * [st.sampled_from([0.0, 1.0, 1.0 + 1e-7, 1e-12, -3.0, 0.5, 1e9])]), max_size=60),
-       st.integers(1, 3), st.integers(0, 2**16))
-def test_any_cloud_gives_a_surface_or_an_error(device, places, degree, seed):
-    points = np.array(places, float).reshape(-1, 3)
-    normals = np.random.default_rng(seed).normal(size=points.shape)
-    try:
-        surface = build_slim(PointCloud(points, normals=normals), degree=degree, device=device)
-    except InputError:
-        return
-    check_sane(surface)
 
 
 def test_progress_rises_and_cancels(device):
