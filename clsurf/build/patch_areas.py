@@ -48,8 +48,8 @@ def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
     """Return the patches of a mesh: exactly `request.patches`, or of `request.spacing`, or as good as `request.error`.
 
     With none of them the number of nodes goes with that of vertices, as in the paper's Table 1, `DEFAULT_NODES` at
-    least; more patches are made
-    where cones, creases and separate parts of the mesh ask for them. The strips along sharp edges count as patches.
+    least; more patches are made where cones, creases and separate parts of the mesh ask for them. The strips along
+    sharp edges count as patches.
 
     Raises
     ------
