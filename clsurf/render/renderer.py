@@ -11,6 +11,7 @@ from ..surface.patch import PatchSurface
 from ..surface.slim import SlimSurface
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
+from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
@@ -75,6 +76,12 @@ class Renderer:
             Of "color", "depth", "normal", "position", "id", "count", "level", "cost" (see `Frame`); "cost" is the
             number of surfel evaluations per pixel of the pixel's bin of 8x8, or that of tests of a pixel against a
             cell of a patch. For patches "count" is 1 and "level" the mip level, 0 for the patch's own nodes.
+            Curvature of SLIM surfaces (float32, NaN elsewhere), from blended derivatives of the surfels (paper,
+            equation 8, left), world units: "mean", "gaussian", "k1" >= "k2" (1/length; positive where the surface
+            curves away from the side its stored normals point to, that of the eye where it is not oriented),
+            "direction1", "direction2" (world, unit; their sign is arbitrary), "radial": the normal curvature along
+            the direction to the eye in the tangent plane. With surfels of degree 3, in 1/length^2: "derivative1",
+            that of k1 along direction1, "derivative2", "radial_derivative", that of "radial" along its direction.
         shading : Shading, optional
         lod : float
             Surfels that appear up to this many pixels wide are drawn in place of the finer ones below them: 4 is safe,
@@ -104,7 +111,9 @@ class Renderer:
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
         factor = checked_supersampling(supersampling)
         picture, size = size, checked_size([n * factor for n in size])
-        wanted, channels = channels, fine_channels(channels, factor)
+        asked, channels = channels, fine_channels(channels, factor)
+        curved = wanted_differentials(channels)
+        channels, wanted = ([name for name in names if name in CHANNELS] for names in (channels, asked))
         shading = Shading() if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
         if not isinstance(shading, Shading):
             raise InputError(f"shading: expected a clsurf.Shading or the name of a look, got {shading!r}")
@@ -114,12 +123,13 @@ class Renderer:
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
+        check_differentials(scene.placed, curved, shading.look)
         own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
         try:
             # The stages of a frame.
             placed, origin = scene.placed, scene_origin(scene)
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface)
-            grid = self._new_grid(placed, size, channels, shading, patches, planes=not at_once)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             if at_once:
@@ -134,9 +144,10 @@ class Renderer:
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
                                shading.look != "flat", channels)
             if factor > 1:
-                arrays = average(self.device, arrays, picture, factor, wanted, self._scratch.lanes)
-            return Frame({name: self.device.download(array, copy=False) for name, array in arrays.items()}, origin,
-                         camera)
+                arrays = average(self.device, arrays, picture, factor, wanted, curved, self._scratch.lanes)
+            arrays = {name: self.device.download(array, copy=False) for name, array in arrays.items()}
+            arrays |= split_differentials(arrays.pop(NAME), curved) if curved else {}
+            return Frame({name: arrays[name] for name in asked}, origin, camera)
         finally:
             self.device.profile = own_profile
 
@@ -144,7 +155,7 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, shading, patches, planes: bool) -> Grid:
+    def _new_grid(self, placed, size, channels, curved, shading, patches, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
         colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
                                                for s, _ in placed)
@@ -153,10 +164,11 @@ class Renderer:
         lit = patches.shading == "gouraud" and shading.look != "flat" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed)
         layout = Layout(color=(colored or lit) and "color" in channels, id="id" in channels, count="count" in channels,
-                        level="level" in channels, lit=lit)
+                        level="level" in channels, lit=lit, differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,
+                                 differentials=4 * layout.differential_planes * pixels,
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
         patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
         if not planes:
@@ -213,10 +225,10 @@ def checked_size(size) -> tuple[int, int]:
 def checked_channels(channels) -> tuple[str, ...]:
     """Return the channels' names, or raise InputError."""
     channels = (channels,) if isinstance(channels, str) else tuple(dict.fromkeys(channels))
-    unknown = [name for name in channels if name not in CHANNELS]
+    unknown = [name for name in channels if name not in CHANNELS and name not in DIFFERENTIALS]
     if unknown or not channels:
         got = ", ".join(map(str, channels)) or "none"
-        raise InputError(f"channels: expected some of {', '.join(CHANNELS)}, got {got}")
+        raise InputError(f"channels: expected some of {', '.join((*CHANNELS, *DIFFERENTIALS))}, got {got}")
     return channels
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.srgb import to_linear
+from .differentials import NAME
 from .patch_drawing import PatchDrawing
 from .tiles import BIN, Grid, Scratch
 
@@ -130,29 +131,35 @@ def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
 
 def shade_constants(grid: Grid, lit: bool, channels) -> dict[str, int]:
     """Return the constants of kernels/render/shade.clh."""
-    pixels = sum(max(CHANNELS[name][0], 1) for name in channels) * grid.size[0] * grid.size[1]
+    values = sum(max(CHANNELS[name][0], 1) for name in channels) + grid.layout.differential_planes
+    pixels = values * grid.size[0] * grid.size[1]
     return {f"WRITE_{name.upper()}": name in channels for name in ("color", "depth", "normal", "position", "cost")} | {
         "LIT": lit, "STREAMED": 4 * pixels > STREAMED_BYTES}
 
 
-def new_channels(device: Device, size: tuple[int, int], channels) -> dict[str, DeviceArray]:
-    """Return room for the channels of a picture by name."""
+def new_channels(device: Device, size: tuple[int, int], channels, differentials: int = 0) -> dict[str, DeviceArray]:
+    """Return room for the channels of a picture by name, and for `differentials` planes of curvature."""
     out = {}
     for name in channels:
         parts, dtype = CHANNELS[name]
         out[name] = device.empty((size[1], size[0], parts) if parts else (size[1], size[0]), dtype)
+    if differentials:
+        out[NAME] = device.empty((differentials, size[1], size[0]), np.float32)
     return out
 
 
 def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps: DeviceArray, lit: bool,
           channels) -> dict[str, DeviceArray]:
-    """Write the channels of the picture from the grid's planes; return them by name, on the device."""
+    """Write the channels of the picture from the grid's planes; return them by name, on the device.
+
+    `channels` are of `CHANNELS`; those of curvature, which the grid's layout names, come in one array.
+    """
     width, height = grid.size
-    out = new_channels(device, grid.size, channels)
+    out = new_channels(device, grid.size, channels, grid.layout.differential_planes)
     constants = grid.layout.constants | {"VW": scratch.lanes, "SPAN": SPAN} | shade_constants(grid, lit, channels)
     items = (width, height) if scratch.lanes == 1 else (-(-width // SPAN), -(-height // BIN))
     unused = scratch.array("unused", (4,), np.float32)
     device.kernel("render/shade.cl", constants=constants)(
         items, (8, 8) if scratch.lanes == 1 else (1, 1), view, lamps, grid.planes, grid.touched, grid.bins_x, width,
-        height, *(out.get(name, unused) for name in CHANNELS))
+        height, *(out.get(name, unused) for name in (*CHANNELS, NAME)))
     return out

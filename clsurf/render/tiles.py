@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
+from .differentials import field_constants, plane_counts
 
 BIN = 8  # pixels; kernels/common/bins.clh
 VIEW_FLOATS = 32  # kernels/common/view.clh
@@ -26,6 +27,13 @@ class Layout:
     count: bool = False
     level: bool = False
     lit: bool = False  # some colours are lit already
+    differentials: tuple[str, ...] = ()  # channels of curvature, in the order of their planes
+
+    @property
+    def differential_planes(self) -> int:
+        """Planes of all channels of curvature."""
+        scalars, vectors = plane_counts(self.differentials)
+        return scalars + 3 * vectors
 
     @property
     def constants(self) -> dict[str, int]:
@@ -34,6 +42,9 @@ class Layout:
         for name, planes in (("color", 3), ("id", 1), ("count", 1), ("level", 1)):
             out[f"FIELD_{name.upper()}"] = at if getattr(self, name) else -1
             at += planes if getattr(self, name) else 0
+        if self.differentials:
+            out |= field_constants(self.differentials, at)
+            at += self.differential_planes
         return out | {"FIELDS": at, "LIT_COLORS": self.lit}
 
 

@@ -19,7 +19,11 @@
 #define WRITE_LEVEL 0
 #define WRITE_COST 0
 #endif
-#define OTHERS (WRITE_DEPTH || WRITE_NORMAL || WRITE_POSITION || WRITE_ID || WRITE_COUNT || WRITE_LEVEL || WRITE_COST)
+#ifndef DIFFERENTIAL_SCALARS
+#define DIFFERENTIAL_SCALARS 0  // pictures of one value, then of three values per pixel
+#define DIFFERENTIAL_VECTORS 0
+#endif
+#define OTHERS (DIFFERENTIAL_SCALARS || DIFFERENTIAL_VECTORS || WRITE_DEPTH || WRITE_NORMAL || WRITE_POSITION || WRITE_ID || WRITE_COUNT || WRITE_LEVEL || WRITE_COST)
 
 // Index of the sample that speaks for a pixel whose first sample is `first`.
 inline size_t chosen_sample(__global const float *depth, size_t first, int row) {
@@ -38,9 +42,9 @@ inline size_t chosen_sample(__global const float *depth, size_t first, int row) 
 __kernel void average(int width, int height, __global const float4 *fine_color, __global const float *fine_depth,
                       __global const float *fine_normal, __global const float *fine_position,
                       __global const int *fine_id, __global const int *fine_count, __global const int *fine_level,
-                      __global const int *fine_cost, __global float4 *color, __global float *depth,
+                      __global const int *fine_cost, __global const float *fine_differentials, __global float4 *color, __global float *depth,
                       __global float *normal, __global float *position, __global int *id, __global int *count,
-                      __global int *level, __global int *cost) {
+                      __global int *level, __global int *cost, __global float *differentials) {
   int x0 = get_global_id(0) * SPAN, y = get_global_id(1), row = width * FACTOR;
   if (x0 >= width || y >= height) return;
   for (int x = x0; x < (x0 + SPAN < width ? x0 + SPAN : width); x++) {
@@ -74,6 +78,14 @@ __kernel void average(int width, int height, __global const float4 *fine_color, 
 #endif
 #if WRITE_COST
     cost[at] = fine_cost[best];
+#endif
+#if DIFFERENTIAL_SCALARS || DIFFERENTIAL_VECTORS
+    size_t pixels = (size_t)width * height, fine_pixels = pixels * FACTOR * FACTOR;
+    for (int i = 0; i < DIFFERENTIAL_SCALARS; i++)
+      differentials[i * pixels + at] = fine_differentials[i * fine_pixels + best];
+    for (int i = DIFFERENTIAL_SCALARS; i < DIFFERENTIAL_SCALARS + 3 * DIFFERENTIAL_VECTORS; i += 3)
+      for (int c = 0; c < 3; c++)
+        differentials[i * pixels + 3 * at + c] = fine_differentials[i * fine_pixels + 3 * best + c];
 #endif
   }
 }

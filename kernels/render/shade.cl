@@ -24,8 +24,36 @@ INLINE VF load_row(__global const float *planes, __global const int *touched, in
   return value;
 }
 
+// Put the channels of curvature, as they come from the tile stages but for the axes of directions.
+INLINE void put_differentials(__global const float *view, __global const float *planes, __global const int *touched,
+                              int bins_x, size_t pixels, int width, int x, int y, int lanes, VF depth,
+                              __global float *out) {
+  VF none = NONE;
+  VI hit = depth < EMPTY_DEPTH;
+  size_t at = (size_t)y * width + x;
+  for (int i = 0; i < DIFFERENTIAL_SCALARS; i++) {
+    VF value = load_row(planes, touched, bins_x, x, y, FIELD_DIFFERENTIAL + i, 0.0f);
+    put_values(out + i * pixels + at, SEL(none, value, hit), lanes);
+  }
+  for (int i = DIFFERENTIAL_SCALARS; i < DIFFERENTIAL_SCALARS + 3 * DIFFERENTIAL_VECTORS; i += 3) {
+    VF vx = load_row(planes, touched, bins_x, x, y, FIELD_DIFFERENTIAL + i, 0.0f);
+    VF vy = load_row(planes, touched, bins_x, x, y, FIELD_DIFFERENTIAL + i + 1, 0.0f);
+    VF vz = load_row(planes, touched, bins_x, x, y, FIELD_DIFFERENTIAL + i + 2, 0.0f);
+    put_triples(out + i * pixels + 3 * at, SEL(none, WORLD(0, vx, vy, vz), hit), SEL(none, WORLD(1, vx, vy, vz), hit),
+                SEL(none, WORLD(2, vx, vy, vz), hit), lanes);
+  }
+}
+
+INLINE void no_differentials(size_t pixels, int width, int x, int y, int count, __global float *out) {
+  size_t at = (size_t)y * width + x;
+  for (int i = 0; i < DIFFERENTIAL_SCALARS; i++) fill(out + i * pixels + at, count, NONE);
+  for (int i = DIFFERENTIAL_SCALARS; i < DIFFERENTIAL_SCALARS + 3 * DIFFERENTIAL_VECTORS; i += 3)
+    fill(out + i * pixels + 3 * at, 3 * count, NONE);
+}
+
 INLINE void shade_run(__global const float *view, __global const float *shading, __global const float *planes,
-                      __global const int *touched, int bins_x, int width, int x, int x_end, int y, Channels out) {
+                      __global const int *touched, int bins_x, int width, int height, int x, int x_end, int y,
+                      Channels out, __global float *differentials) {
   int lanes = x_end - x < VW ? x_end - x : VW;
   Shown s;
 #define FIELD(field, none) load_row(planes, touched, bins_x, x, y, field, none)
@@ -44,6 +72,7 @@ INLINE void shade_run(__global const float *view, __global const float *shading,
   s.level = AS_VI(FIELD(FIELD_LEVEL, 0.0f));
 #endif
   shade_row(view, shading, &s, width, x, y, lanes, out);
+  put_differentials(view, planes, touched, bins_x, (size_t)width * height, width, x, y, lanes, s.depth, differentials);
 #if WRITE_COST
   for (int i = 0; i < lanes; i++) {
     int c = touched[y / BIN * bins_x + (x + i) / BIN];
@@ -55,13 +84,16 @@ INLINE void shade_run(__global const float *view, __global const float *shading,
 __kernel void shade(__global const float *view, __global const float *shading, __global const float *planes,
                     __global const int *touched, int bins_x, int width, int height,
                     __global float4 *color, __global float *depth, __global float *normal, __global float *position,
-                    __global int *id, __global int *count, __global int *level, __global int *cost) {
+                    __global int *id, __global int *count, __global int *level, __global int *cost,
+                    __global float *differentials /* a picture per channel: the scalars, then the vectors */) {
   Channels out = {color, depth, normal, position, id, count, level, cost};
 #if VW == 1
   int x = get_global_id(0), y = get_global_id(1);
   if (x >= width || y >= height) return;
-  if (touched[y / BIN * bins_x + x / BIN] < 0) background_row(shading, width, x, y, 1, out);
-  else shade_run(view, shading, planes, touched, bins_x, width, x, x + 1, y, out);
+  if (touched[y / BIN * bins_x + x / BIN] < 0) {
+    background_row(shading, width, x, y, 1, out);
+    no_differentials((size_t)width * height, width, x, y, 1, differentials);
+  } else shade_run(view, shading, planes, touched, bins_x, width, height, x, x + 1, y, out, differentials);
 #else
   int x0 = get_global_id(0) * SPAN, y0 = get_global_id(1) * BIN;
   if (x0 >= width || y0 >= height) return;
@@ -71,13 +103,16 @@ __kernel void shade(__global const float *view, __global const float *shading, _
     int run = x;  // untouched bins from x on
     while (run < x1 && row[run / BIN] < 0) run = (run / BIN + 1) * BIN;
     run = run < x1 ? run : x1;
-    for (int y = y0; y < y1 && run > x; y++) background_row(shading, width, x, y, run - x, out);
+    for (int y = y0; y < y1 && run > x; y++) {
+      background_row(shading, width, x, y, run - x, out);
+      no_differentials((size_t)width * height, width, x, y, run - x, differentials);
+    }
     x = run;
     if (x >= x1) return;
     // Lanes of 16 cover two bins; the second one may be untouched.
     for (int y = y0; y < y1; y++)
       for (int part = x; part < x + (VW > BIN ? VW : BIN) && part < x1; part += VW)
-        shade_run(view, shading, planes, touched, bins_x, width, part, x1, y, out);
+        shade_run(view, shading, planes, touched, bins_x, width, height, part, x1, y, out, differentials);
     x += VW > BIN ? VW : BIN;
   }
 #endif

@@ -11,6 +11,7 @@
 #include "common/bins.clh"
 #include "common/planes.clh"
 #include "common/view.clh"
+#include "render/differentials.clh"
 
 #ifndef TILE_BINS
 #define TILE_BINS 4
@@ -36,7 +37,14 @@
 #define LANE_Y(first) (LANE_INDEX >> 2)
 #endif
 
-typedef struct { VF depth, weight, fx, fy, ft, red, green, blue; VI nearest, number; } Blend;
+typedef struct {
+  VF depth, weight, fx, fy, ft, red, green, blue;
+  VI nearest, number;
+#if DERIVATIVES
+  VF facing;
+  Jet jet;
+#endif
+} Blend;
 
 INLINE VI inside_footprint(uint lo, uint hi, VF u, VF v) {
   const float unit = 1.0f / 255.0f, half_root = 0.70710678f;
@@ -163,6 +171,9 @@ INLINE void blend(PAIRS pairs, int count, uint block, __global const float *reco
     sum->fx += tilt * (k[WX] - gu * k[UX] - gv * k[VX]);
     sum->fy += tilt * (k[WY] - gu * k[UY] - gv * k[VY]);
     sum->ft -= weight * k[RADIUS] * SEL((VF)(0.0f), slope, inside);
+#if DERIVATIVES
+    add_jet(&sum->jet, k, ORIENTED ? weight : weight * side, u, v, du, dv);
+#endif
 #if HAS_COLOR
     float4 color = colors[index];
     sum->red += weight * color.x; sum->green += weight * color.y; sum->blue += weight * color.z;
@@ -188,6 +199,11 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   best.depth = infinite;
   best.weight = best.fx = best.fy = best.ft = best.red = best.green = best.blue = 1.0f;
   best.nearest = 0; best.number = 0;
+#if DERIVATIVES
+#define CLEAR_BEST(d) best.jet.d = 0.0f;
+  EACH_DERIVATIVE(CLEAR_BEST)
+  best.facing = 1.0f;
+#endif
   int cost = 0;
   for (int attempt = 0; attempt < TRIES; attempt++) {
     VF z = SEL(-infinite, before, active), hit = infinite, facing = 0.0f;
@@ -207,6 +223,10 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
     Blend sum;
     sum.depth = sum.weight = sum.fx = sum.fy = sum.ft = sum.red = sum.green = sum.blue = 0.0f;
     sum.nearest = 0; sum.number = 0;
+#if DERIVATIVES
+#define CLEAR_SUM(d) sum.jet.d = 0.0f;
+    EACH_DERIVATIVE(CLEAR_SUM)
+#endif
 #if VW == 1
     blend(pairs, count, 1u << quarter, records, colors, px, py, hit, facing, &sum, &cost);
 #else
@@ -222,6 +242,11 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
     best.nearest = SEL(best.nearest, nearest, found);
 #if HAS_COLOR
     KEEP(red); KEEP(green); KEEP(blue);
+#endif
+#if DERIVATIVES
+#define KEEP_DERIVATIVE(d) KEEP(jet.d);
+    EACH_DERIVATIVE(KEEP_DERIVATIVE)
+    best.facing = SEL(best.facing, ORIENTED ? facing : (VF)(1.0f), found);
 #endif
     any_hit = any_hit | found;
     active = found & (sum.weight < SUPPORT);
@@ -254,6 +279,9 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   VI level;
   for (int i = 0; i < VW; i++) ((int *)&level)[i] = levels[((int *)&best.nearest)[i]];
   merge_plane(planes, FIELD_LEVEL, at, AS_VF(level), closer);
+#endif
+#if DERIVATIVES
+  merge_differentials(view, planes, at, &best.jet, gx, gy, gz, px, py, best.facing, closer);
 #endif
   return cost;
 }

@@ -165,7 +165,7 @@ def tile_slim(degree, view, records, pixels, oriented=True, footprint=None):
     z = np.stack([hits(degree, records, pixels, side, footprint) for side in (1.0, -1.0)])  # (side, p, n)
     low, active = np.full(p, v.near), np.ones(p, bool)
     out = SimpleNamespace(depth=np.full(p, np.inf), gradient=np.full((p, 3), np.nan), count=np.zeros(p, int),
-                          nearest=np.full(p, -1), weight=np.zeros(p))
+                          nearest=np.full(p, -1), weight=np.zeros(p), hit=np.zeros(p), side=np.ones(p))
     for _ in range(TRIES):
         key = np.where(z > low[:, None], z, np.inf)
         key[1] += records[:, BIAS] if oriented else 0
@@ -180,7 +180,7 @@ def tile_slim(degree, view, records, pixels, oriented=True, footprint=None):
         weight, depth, gradient, count = blended(degree, view, records, pixels, hit, side, oriented)
         found &= weight > 0
         for name, value in (("depth", depth), ("gradient", gradient), ("count", count), ("nearest", nearest),
-                            ("weight", weight)):
+                            ("weight", weight), ("hit", hit), ("side", side)):
             getattr(out, name)[found] = value[found]
         active = found & (weight < SUPPORT)
         low = np.where(active, hit, low)
