@@ -172,7 +172,7 @@ INLINE void blend(PAIRS pairs, int count, uint block, __global const float *reco
     sum->fy += tilt * (k[WY] - gu * k[UY] - gv * k[VY]);
     sum->ft -= weight * k[RADIUS] * SEL((VF)(0.0f), slope, inside);
 #if DERIVATIVES
-    add_jet(&sum->jet, k, ORIENTED ? weight : weight * side, u, v, du, dv);
+    add_jet(&sum->jet, k, ORIENTED ? weight : weight * side, u, v, du, dv, p, step);
 #endif
 #if HAS_COLOR
     float4 color = colors[index];
