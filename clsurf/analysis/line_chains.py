@@ -1,0 +1,139 @@
+"""From points on pixel edges to polylines: segments within cells of four pixels, chains, hysteresis, order."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, depth_first_order
+
+from .line_planes import Crossings
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Polylines: points[offset[i]:offset[i + 1]] in order; a closed one's last point is joined to its first."""
+
+    points: NDArray  # (n, 4) float32: x, y (pixels), depth, strength
+    offset: NDArray  # (k + 1,) int64
+    closed: NDArray  # (k,) bool
+
+
+def cell_segments(crossings: Crossings, contours: bool) -> NDArray:
+    """Return pairs (m, 2) of points that are joined within a cell, the square of four neighbouring pixels' centres.
+
+    Of three points the two nearest to each other are joined; of `contours` the strongest (before the background, so
+    that outlines close), then the nearest to the eye. Four are joined in the two pairs that are shorter together.
+    """
+    edges, points, columns = crossings.edges, crossings.points, crossings.columns
+    if len(edges) == 0:
+        return np.empty((0, 2), np.int64)
+    number = np.full(2 * columns * (crossings.height + 1) + 2, -1, np.int32)
+    number[edges] = np.arange(len(edges))
+    pixel, down = edges >> 1, edges & 1
+    before = pixel - np.where(down, 1, columns)  # the other cell that the edge belongs to
+    cells = np.unique(np.concatenate([pixel, before[before >= 0]]))
+    # Top, left, bottom, right.
+    found = np.stack([number[2 * cells], number[2 * cells + 1], number[2 * (cells + columns)],
+                      number[2 * (cells + 1) + 1]], axis=1)
+    count = (found >= 0).sum(axis=1)
+    two, three, four = found[count == 2], found[count == 3], found[count == 4]
+    pairs = [two[two >= 0].reshape(-1, 2)]
+    if len(three):
+        three = three[three >= 0].reshape(-1, 3)
+        choices = np.array([[0, 1], [1, 2], [0, 2]])
+        chosen = three[:, choices]  # (t, 3, 2)
+        far = 1 + np.abs(points[:, 2]).max()
+        cost = (points[chosen, 2] - 4 * far * points[chosen, 3]).sum(axis=2) if contours else _lengths(points, chosen)
+        pairs.append(chosen[np.arange(len(three)), np.argmin(cost, axis=1)])
+    if len(four):
+        a, b = four[:, [[0, 1], [2, 3]]], four[:, [[0, 3], [1, 2]]]
+        shorter = _lengths(points, a).sum(axis=1) <= _lengths(points, b).sum(axis=1)
+        pairs.append(np.where(shorter[:, None, None], a, b).reshape(-1, 2))
+    return np.concatenate(pairs).astype(np.int64)
+
+
+def _lengths(points, pairs):
+    """Lengths (...) in pixels between the points that pairs (..., 2) name."""
+    d = points[pairs[..., 0], :2] - points[pairs[..., 1], :2]
+    return np.hypot(d[..., 0], d[..., 1])
+
+
+def chains(points: NDArray, segments: NDArray, peak: float, length: float) -> Chains:
+    """Join segments into polylines; keep those at least `length` pixels long and somewhere as strong as `peak`.
+
+    No point may belong to more than two segments.
+    """
+    n = len(points)
+    if len(segments) == 0:
+        return Chains(np.empty((0, 4), np.float32), np.zeros(1, np.int64), np.empty(0, bool))
+    graph = coo_array((np.ones(len(segments), np.int8), (segments[:, 0], segments[:, 1])), shape=(n, n)).tocsr()
+    count, label = connected_components(graph, directed=False)
+    total = np.bincount(label[segments[:, 0]], _lengths(points, segments), count)
+    highest = np.full(count, -np.inf)
+    np.maximum.at(highest, label, points[:, 3])
+    keep = (total >= length) & (highest >= peak)
+    used = segments[keep[label[segments[:, 0]]]]
+    if len(used) == 0:
+        return Chains(np.empty((0, 4), np.float32), np.zeros(1, np.int64), np.empty(0, bool))
+    degree = np.bincount(used.ravel(), minlength=n)
+    own = np.flatnonzero(degree)
+    # Every line starts at its first end, or a closed one at its first point.
+    start = np.full(count, n)
+    np.minimum.at(start, label[own], own)
+    ends = np.flatnonzero(degree == 1)
+    first_end = np.full(count, n)
+    np.minimum.at(first_end, label[ends], ends)
+    lines = np.unique(label[own])
+    closed = first_end[lines] == n
+    starts = np.where(closed, start[lines], first_end[lines])
+    return Chains(*_ordered(points, used, starts), closed)
+
+
+def _ordered(points, segments, starts):
+    """Return the points line by line in order, and the lines' offsets; each line is walked from its start."""
+    # A search in depth walks a line from end to end. Lines hang in a row on points of their own, so that one search
+    # walks all of them.
+    n, k = len(points), len(starts)
+    hooks = n + np.arange(k)
+    rows = np.concatenate([segments[:, 0], hooks, hooks[:-1]])
+    columns = np.concatenate([segments[:, 1], starts, hooks[1:]])
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(n + k, n + k)).tocsr()
+    walk = depth_first_order(graph, n, directed=False, return_predecessors=False)
+    inside = walk < n
+    # Each hook comes before or after its line's points; the points of one line are never separated.
+    at = np.flatnonzero(inside)
+    walk = walk[at]
+    mark = np.zeros(n, bool)
+    mark[starts] = True
+    order_starts = np.flatnonzero(mark[walk])
+    lines = np.split(walk, order_starts[1:])
+    back = np.empty(n, np.int64)
+    back[starts] = np.arange(k)
+    turn = np.argsort(back[walk[order_starts]])
+    lines = [lines[i] for i in turn]
+    offset = np.concatenate([[0], np.cumsum([len(line) for line in lines])])
+    return points[np.concatenate(lines)], offset
+
+
+def relaxed(found: Chains, rounds: int) -> NDArray:
+    """Return the points (n, 4), each the mean of itself (1/2) and its line's neighbours (1/4 each), `rounds` times.
+
+    Ends stay in place; strengths are smoothed four times as often, so that widths change gently.
+    """
+    n = len(found.points)
+    if n == 0:
+        return found.points.copy()
+    before, after = np.arange(n) - 1, np.arange(n) + 1
+    first, last = found.offset[:-1], found.offset[1:] - 1
+    before[first] = np.where(found.closed, last, first)
+    after[last] = np.where(found.closed, first, last)
+    points = found.points.copy()
+    held = np.concatenate([first[~found.closed], last[~found.closed]])
+    ends = points[held, :3]
+    for i in range(4 * rounds):
+        # Each of the ends counts as its own neighbour.
+        parts = slice(None) if i < rounds else slice(3, None)
+        points[:, parts] = 0.5 * points[:, parts] + 0.25 * (points[before][:, parts] + points[after][:, parts])
+    points[held, :3] = ends
+    return points

@@ -1,0 +1,189 @@
+"""Feature lines of a picture: occluding and suggestive contours, ridges, valleys, crest and parabolic lines.
+
+Sources: Ohtake, Belyaev, Alexa, "Sparse Low-degree Implicit Surfaces", SGP 2005, section 4; suggestive contours:
+DeCarlo, Finkelstein, Rusinkiewicz, Santella, "Suggestive Contours for Conveying Shape", SIGGRAPH 2003; ridges, valleys
+and crest lines: Ohtake, Belyaev, Seidel, "Ridge-Valley Lines on Meshes via Implicit Surface Fitting", SIGGRAPH 2004.
+"""
+
+
+import numpy as np
+
+from ..device import open_device
+from ..errors import InputError
+from ..render.frame import Frame
+from .line_chains import Chains, cell_segments, chains, relaxed
+from .line_planes import Field, LinePlanes
+from .line_strokes import Lines
+
+# Thresholds in units of the median |H| (squared for suggestive contours), found on bunny, dragon, Max Planck and lion.
+FIELDS = {
+    "suggestive_contours": (Field("radial", "radial_derivative", sines=True, power=2, least=0.6, peak=4.0, full=16.0),),
+    "ridges": (Field("derivative1", "k1", axis="direction1", least=1.5, peak=3.0, full=8.0),),
+    "valleys": (Field("derivative2", "k2", sign=-1, axis="direction2", extremum=-1, least=1.5, peak=3.0, full=8.0),),
+    "crest": (Field("derivative1", "k1", axis="direction1", other="k2", least=1.5, peak=3.0, full=8.0),
+              Field("derivative2", "k2", sign=-1, axis="direction2", extremum=-1, other="k1", least=1.5, peak=3.0,
+                    full=8.0)),
+    "parabolic": (Field("gaussian", "mean", sign=0, least=0.25, peak=1.0, full=4.0),),
+}
+KINDS = ("contours", *FIELDS)
+CONTOUR_LENGTH = 12.0  # pixels; shorter ones are holes and fragments
+CONTOUR_ROUNDS, ROUNDS = 6, 2  # of smoothing along the lines
+MEDIAN_STEP = 4  # every 4th pixel each way gives the median of |H|
+HIDDEN_FOOTPRINTS = 16.0  # a line so far behind the silhouette's surface is hidden
+
+
+def line_channels(kinds) -> tuple[str, ...]:
+    """Return the channels that `lines` needs of a frame for the given kind or kinds of lines.
+
+    Examples
+    --------
+    >>> line_channels("contours")
+    ('depth', 'normal')
+    """
+    names = [name for kind in checked_kinds(kinds) for field in FIELDS.get(kind, ()) for name in field.channels]
+    return tuple(dict.fromkeys(("depth", "normal", *names)))
+
+
+def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None = None, smoothing: float = 1.3,
+          detail: float = 1.0, length: float = 15.0, device=None) -> Lines:
+    """Find feature lines in a picture, as polylines with sub-pixel vertices.
+
+    Parameters
+    ----------
+    frame : Frame
+        With the channels `line_channels(kinds)`, from a surface of degree 3 for the kinds that need third derivatives:
+        all but "contours" and "parabolic". A coarse surface (error 0.01 to 0.02) gives the cleaner lines.
+    kinds : str or sequence of str
+        "contours" (occluding: where the surface seen ends), "suggestive_contours" (where the radial curvature changes
+        its sign), "ridges" (maxima of k1 along its direction), "valleys" (minima of k2), "crest" (those of both where
+        the other curvature is smaller in size), "parabolic" (where the Gaussian curvature changes its sign).
+    silhouette : Frame, optional
+        A picture of a finer surface, same camera and size, with depth and normal: occluding contours come from it, and
+        the other lines end where it shows no surface or one in front of them.
+    smoothing : float
+        Standard deviation in pixels, 0 to 2.6, of the Gaussian that smooths the fields; it stops at depth jumps.
+    detail : float
+        Larger than 1 shows weaker lines, smaller fewer: thresholds are divided by it.
+    length : float
+        Pixels; shorter lines are dropped. Occluding contours: at most 12.
+    device : None, str or Device
+
+    Returns
+    -------
+    Lines
+
+    Raises
+    ------
+    InputError
+        An unknown kind, a frame without a camera or without a channel that is needed, an option out of range.
+
+    Notes
+    -----
+    Strengths are relative to the median size of the mean curvature over the picture, so nothing depends on units.
+    """
+    kinds = checked_kinds(kinds)
+    check_frame("frame", frame, line_channels([kind for kind in kinds if kind != "contours" or silhouette is None]))
+    _check_options(smoothing, detail, length)
+    if silhouette is not None:
+        check_frame("silhouette", silhouette, ("depth", "normal"))
+        if silhouette.size != frame.size:
+            raise InputError(f"silhouette: expected the frame's size {frame.size}, got {silhouette.size}")
+    device = open_device(device)
+    parts = []
+    planes = LinePlanes(device, frame)
+    for number, kind in enumerate(kinds):
+        if kind != "contours":
+            parts += [(number, part) for part in _field_lines(planes, kind, silhouette, smoothing, detail, length)]
+    if "contours" in kinds:  # last: the other frame's planes take the place of this one's
+        outline = planes if silhouette is None else LinePlanes(device, silhouette)
+        parts.append((kinds.index("contours"), _contours(outline, min(length, CONTOUR_LENGTH))))
+    return _joined(frame, kinds, parts, device)
+
+
+def _field_lines(planes: LinePlanes, kind, silhouette, smoothing, detail, length) -> list[Chains]:
+    """Return the lines of one kind, their strengths from 0 to 1."""
+    out = []
+    for field in FIELDS[kind]:
+        unit = median_curvature(planes.frame)**field.power / detail
+        found = planes.field_crossings(field, smoothing, field.least * unit)
+        if silhouette is not None:
+            found = found.chosen(_shown(silhouette, found.points))
+        joined = chains(found.points, cell_segments(found, contours=False), field.peak * unit, length)
+        points = relaxed(joined, ROUNDS)
+        points[:, 3] = np.sqrt(np.clip(points[:, 3] / (field.full * unit), 0, 1))
+        out.append(Chains(points, joined.offset, joined.closed))
+    return out
+
+
+def _contours(planes: LinePlanes, length) -> Chains:
+    found = planes.contour_crossings()
+    joined = chains(found.points, cell_segments(found, contours=True), 0.0, length)
+    points = relaxed(joined, CONTOUR_ROUNDS)
+    points[:, 3] = 1
+    return Chains(points, joined.offset, joined.closed)
+
+
+def _shown(silhouette: Frame, points):
+    """Which points (n, 4) lie on what `silhouette` shows."""
+    x, y = (points[:, i].astype(np.int64).clip(0, silhouette.size[i] - 1) for i in (0, 1))
+    depth, p = silhouette.depth[y, x], silhouette.camera.projection(silhouette.size)
+    footprint = (np.abs(depth) if p.perspective else 1.0) / p.fx
+    with np.errstate(invalid="ignore"):
+        return points[:, 2] - depth <= HIDDEN_FOOTPRINTS * footprint
+
+
+def _joined(frame, kinds, parts, device) -> Lines:
+    """Return all lines of all kinds in one result."""
+    points = np.concatenate([np.empty((0, 4), np.float32), *(part.points for _, part in parts)])
+    counts = np.concatenate([np.empty(0, np.int64), *(np.diff(part.offset) for _, part in parts)])
+    numbers = [np.full(len(part.closed), number, np.int32) for number, part in parts]
+    return Lines(
+        size=frame.size, kinds=kinds, points=points[:, :2], positions=world_positions(frame, points),
+        strength=points[:, 3], offset=np.concatenate([[0], np.cumsum(counts)]),
+        kind=np.concatenate([np.empty(0, np.int32), *numbers]),
+        closed=np.concatenate([np.empty(0, bool), *(part.closed for _, part in parts)]), device=device)
+
+
+def world_positions(frame: Frame, points) -> np.ndarray:
+    """Return world positions (n, 3) float64 of points (n, 3 or more): x, y (pixels) and depth."""
+    camera, p = frame.camera, frame.camera.projection(frame.size)
+    x, y, depth = (points[:, i].astype(np.float64) for i in range(3))
+    view = np.stack([(x - p.cx) / p.fx, (p.cy - y) / p.fy, -np.ones_like(x)], axis=1)
+    view = view * depth[:, None] if p.perspective else np.stack([view[:, 0], view[:, 1], -depth], axis=1)
+    return camera.eye + view @ camera.rotation
+
+
+def median_curvature(frame: Frame) -> float:
+    """Return the median of |H| over the picture (1 / world unit), the unit of strengths; 1 without a surface."""
+    mean = np.abs(frame.mean[MEDIAN_STEP // 2::MEDIAN_STEP, MEDIAN_STEP // 2::MEDIAN_STEP])
+    mean = mean[np.isfinite(mean)]
+    if len(mean) == 0:
+        mean = np.abs(frame.mean[np.isfinite(frame.mean)])
+    value = float(np.median(mean)) if len(mean) else 1.0
+    return max(value, 1e-30)
+
+
+def checked_kinds(kinds) -> tuple[str, ...]:
+    """Return the kinds of lines as a tuple, or raise InputError."""
+    kinds = (kinds,) if isinstance(kinds, str) else tuple(dict.fromkeys(kinds))
+    unknown = [kind for kind in kinds if kind not in KINDS]
+    if unknown or not kinds:
+        raise InputError(f"kinds: expected some of {', '.join(KINDS)}, got {', '.join(map(str, kinds)) or 'none'}")
+    return kinds
+
+
+def check_frame(name: str, frame, channels) -> None:
+    """Raise InputError unless `frame` is one that `clsurf.render` made with these channels."""
+    if not isinstance(frame, Frame) or frame.camera is None:
+        raise InputError(f"{name}: expected a clsurf.Frame with its camera, as clsurf.render gives it, got {frame!r}")
+    missing = [channel for channel in channels if channel not in frame.channels]
+    if missing:
+        raise InputError(f"{name}: expected the channels {', '.join(channels)}, got none of the name "
+                         f"{', '.join(missing)}: ask for them with render(..., channels=clsurf.line_channels(kinds))")
+
+
+def _check_options(smoothing, detail, length) -> None:
+    for name, value, low, high in (("smoothing", smoothing, 0, 2.6), ("detail", detail, 1e-3, 1e3),
+                                   ("length", length, 0, 1e6)):
+        if not isinstance(value, int | float | np.number) or not low <= value <= high:
+            raise InputError(f"{name}: expected a number from {low:g} to {high:g}, got {value!r}")
