@@ -128,7 +128,7 @@ LAMBDA = 1e-8
 
 def fitted(tree, degree, centers, r_r, penalty=1e-9, mode=slim.SEGMENT):
     device = tree.device
-    need = 2 * twin.terms(degree) + 2
+    need = 2 * twin.terms(min(degree, 2)) + 2
     out = device.empty((len(centers), slim.RECORD), np.float32)
     kernel = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree})
     kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, LAMBDA, penalty, 0.02, need,
@@ -157,6 +157,22 @@ def test_fit_surfels(tree, sorted_points, degree):
             assert np.abs(error).max() < 2e-3 * r_r * (1 if degree < 3 else 3)
             assert np.sqrt((error**2).mean()) < 2e-5
     assert agree > 0.9 * 2 * len(centers) - 20
+
+
+def test_cubics_on_few_points_are_quadratics(tree, sorted_points):
+    """A bent sheet: the smallest balls are quadratics, and no leaf of degree 3 has an E above that of degree 2."""
+    centers = np.arange(0, tree.count, 10)
+    found = {degree: fitted(tree, degree, centers, 0.06, penalty=1e-12)[0] for degree in (2, 3)}
+    few, cubic = (found[3][:, 12:] == 0).all(axis=1), found[3]
+    points = np.array([((sorted_points[0] - sorted_points[0][c]) ** 2).sum(axis=1) for c in centers])
+    count = (points < (cubic[:, 0] * (1 - 1e-5))[:, None] ** 2).sum(axis=1)
+    usual = (points < 0.06 ** 2).sum(axis=1) >= 22  # the ball did not grow
+    leaf = usual & (cubic[:, 5] > 0)
+    assert (leaf & few).sum() > 10 and (leaf & ~few).sum() > 10
+    assert count[leaf & few].max() < 22 and count[leaf & ~few].min() >= 21 and count[leaf].min() >= 13
+    energy = {degree: found[degree][:, 4] ** 2 + 1e-12 / found[degree][:, 0] ** 2 for degree in (2, 3)}
+    both = leaf & (found[2][:, 5] > 0)
+    assert np.mean(energy[3][both] <= energy[2][both] * (1 + 1e-4)) > 0.95
 
 
 def test_fit_leaves_sheet_behind_out(device):

@@ -256,7 +256,7 @@ def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, rep
     """
     device = tree.device
     terms = (degree + 1) * (degree + 2) // 2
-    need = min(2 * terms + 2, tree.count)
+    need = min(2 * min(terms, COEFFICIENTS[2]) + 2, tree.count)  # fewer over-fit; cubics become quadratics before
     choose = device.kernel("build/choose_centers.cl")
     weighted = {"WEIGHTED": 1} if tree.weighted else {}
     fit = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree, **weighted})

@@ -143,13 +143,15 @@ def fit_surfels(points, normals, center, r_r, noise, penalty, need, degree, refi
     radii = r_r * GOLDEN ** (2 * (14 - np.arange(15)) / 14)
     d2 = ((points - points[center]) ** 2).sum(axis=1)
     count = np.array([(d2 < r**2).sum() for r in radii])
-    lowest = int(np.argmax(count >= need))
-    fits = {i: fit_at(points, normals, center, radii[i], 0.618034 * r_r, degree) for i in range(lowest, 15)}
+    full = 22 if degree == 3 else 0  # points of a cubic; with fewer it is a quadratic
+    lowest, lowest_full = int(np.argmax(count >= need)), int(np.argmax(count >= max(need, full)))
+    fits = {i: fit_at(points, normals, center, radii[i], 0.618034 * r_r, degree if count[i] >= full else 2)
+            for i in range(lowest, 15)}
     e2 = np.array([fits[max(i, lowest)][2] for i in range(15)])
     energy = e2 + penalty / radii**2
     best = max(range(lowest, 15), key=lambda i: (-energy[i], i))
-    middle = max(lowest, 7)
-    rising = e2[lowest] <= e2[middle] <= e2[14]
+    first = lowest if best < lowest_full else lowest_full
+    rising = e2[first] <= e2[max(first, 7)] <= e2[14]
     plateau = lowest == 0 and e2[best] > 4 * penalty / radii[best] ** 2 + 3 * noise
     leaf = not plateau and (best == 14 or (best > lowest and rising) or (best == lowest and lowest > 0))
     best = best if leaf else 14
