@@ -56,3 +56,44 @@ def average_normals(sorted_points, reach):
         g = np.maximum(1 - ((x - x[i]) ** 2).sum(axis=1) / reach**2, 0) * (n @ n[i] > 0)
         out[i] = g @ n
     return (out / np.linalg.norm(out, axis=1, keepdims=True)).T
+
+
+def fit_quartics(sorted_points, center, radius):
+    """Return the coefficients (15,) of a surfel of degree 4 in units of its radius."""
+    return heights(*ball(sorted_points, center, radius), 4)
+
+
+def point_curvature(q, n, records, steps):
+    """Return the curvature at q (3,) of the surfels `records` (m, 32) that face n (3,), after Newton steps."""
+    for step in range(steps + 1):
+        weight = f = 0
+        gradient, hessian = np.zeros(3), np.zeros((3, 3))
+        for o in records[np.linalg.norm(records[:, :3] - q, axis=1) < records[:, 3]]:
+            d = (q - o[:3]) / o[3]
+            g = max(1 - d @ d, 0) ** 3 * (n @ o[4:7] > 0)
+            u, v = d @ o[7:10], d @ o[10:13]
+            dh = {(a, b): sum(c * _falling(i, a) * _falling(j, b) * u ** max(i - a, 0) * v ** max(j - b, 0)
+                              for c, (i, j) in zip(o[13:28], POWERS, strict=True))
+                  for a, b in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))}
+            axes = o[7:13].reshape(2, 3)
+            weight += g
+            f += g * o[3] * (d @ o[4:7] - dh[0, 0])
+            gradient += g * (o[4:7] - dh[1, 0] * axes[0] - dh[0, 1] * axes[1])
+            form = np.array([[dh[2, 0], dh[1, 1]], [dh[1, 1], dh[0, 2]]])
+            hessian -= g / o[3] * (axes.T @ form @ axes)
+        if step < steps:
+            q = q - f * gradient / (gradient @ gradient)
+    length = np.linalg.norm(gradient)
+    normal = gradient / length
+    along = np.eye(3) - np.outer(normal, normal)
+    values, vectors = np.linalg.eigh(along @ hessian @ along / length)
+    skip = np.argmax(np.abs(vectors.T @ normal))
+    k2, k1 = np.delete(values, skip)
+    direction = np.delete(vectors, skip, axis=1)[:, 1]
+    return {"position": q, "normal": normal, "mean": (k1 + k2) / 2, "gaussian": k1 * k2, "k1": k1, "k2": k2,
+            "direction1": direction}
+
+
+def _falling(i, a):
+    """i (i - 1) ... (i - a + 1)."""
+    return float(np.prod([i - k for k in range(a)]))

@@ -1,0 +1,86 @@
+"""Sparse surfels of degree 4 that cover a scan, and the blending of their derivatives."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..build.point_tree import BLOCK, PointTree, build_boxes
+from ..device import Device
+from ..device.arrays import DeviceArray
+
+DEGREE = 4
+# Radius of the surfels over the best one of degree 2, and the distance between their centres over their radius.
+RADIUS_RATIO = 1.7
+SPACING = 0.35
+GROWTH = 3.0  # times that a ball with too few points may grow
+TINY = 100  # points of a scan whose balls may grow to hold all of it
+CENTER = 3  # state of a chosen point (spread_centers.cl)
+SURFEL, LEAF = 32, 24  # floats a record of fit_quartics.cl, and of a SLIM surface's leaf (build/project.py)
+
+
+@dataclass(eq=False)
+class SurfelTree:
+    """Local surfaces on a device and a tree over their balls; coordinates (x - middle) / unit.
+
+    Attributes
+    ----------
+    degree : int
+        4: records of fit_quartics.cl, coefficients over the radius; 2 or 3: those of `build.project.leaf_tree`.
+    """
+
+    device: Device
+    degree: int
+    records: DeviceArray  # (n, SURFEL or LEAF) float32
+    padded: int
+    balls: DeviceArray  # (4, padded) float32: centre and radius, -1 for what is no surfel
+    boxes: DeviceArray
+    node_offset: DeviceArray
+    top_level: int
+
+
+def fit_surfels(tree: PointTree, block_radius: NDArray) -> SurfelTree:
+    """Return surfels of degree 4 that cover the points, their radii being `block_radius` (blocks,) float32."""
+    device = tree.device
+    centers = device.upload(spread_centers(tree, SPACING * block_radius))
+    count = len(centers)
+    padded = -(-count // BLOCK) * BLOCK
+    growth = max(GROWTH, 2 / float(block_radius.min())) if tree.count < TINY else GROWTH
+    records, balls = device.empty((padded, SURFEL), np.float32), device.empty((4, padded), np.float32)
+    device.kernel("analysis/fit_quartics.cl")((padded,), (1,), count, padded, centers, device.upload(block_radius),
+                                              growth, *tree.arguments, records, balls)
+    radius = device.upload(device.download(balls)[3])
+    return SurfelTree(device, DEGREE, records, padded, balls, *build_boxes(balls, padded, device, radius=radius))
+
+
+def spread_centers(tree: PointTree, spacing: NDArray) -> NDArray:
+    """Return the sorted points (m,) int32, ascending, that are centres; `spacing` (blocks,) float32."""
+    device = tree.device
+    first, end, colors = tree.cells(float(spacing.max()) * 1.001)
+    first, end, spacing = device.upload(first), device.upload(end), device.upload(spacing)
+    state = device.zeros(tree.padded, np.uint8)
+    choose = device.kernel("analysis/spread_centers.cl")
+    for start, stop in itertools.pairwise(colors):
+        choose((stop - start,), (1,), stop - start, start, first, end, spacing, *tree.arguments, state)
+    return np.flatnonzero(device.download(state, copy=False)[:tree.count] == CENTER).astype(np.int32)
+
+
+def evaluate(surfels: SurfelTree, queries: DeviceArray, count: int, stride: int, order: DeviceArray, out: DeviceArray,
+             steps: int) -> None:
+    """Write position, normal and curvature at points to the rows `order` of `out` (n, 16) float32 (point_curvature.cl).
+
+    Parameters
+    ----------
+    queries : DeviceArray
+        At least (6, stride) float32, of which `count` columns count: positions and normals; neighbours should stand
+        together.
+    steps : int
+        Newton steps onto the blend first.
+    """
+    quartic = surfels.degree == DEGREE
+    constants = {"DEGREE": surfels.degree, "SURFEL": SURFEL if quartic else LEAF, "RADIUS_UNITS": int(quartic),
+                 "STEPS": steps}
+    surfels.device.kernel("analysis/point_curvature.cl", constants=constants)(
+        (-(-count // BLOCK),), (1,), count, stride, queries, order, surfels.records, surfels.padded, surfels.balls,
+        surfels.boxes, surfels.node_offset, surfels.top_level, out)

@@ -1,0 +1,50 @@
+// A surfel of degree 4 about each centre. One work-item per surfel; those that pad the last block get no radius.
+//
+// Where the ball holds fewer than NEED points it grows up to `limit` times; where they stay too few the degree sinks. A
+// surfel without even a quadratic has no radius either: nothing is known there.
+#include "analysis/quartic.clh"
+
+#ifndef NEED
+#define NEED 28 // points of a ball for degree 4
+#endif
+#define NEED_CUBIC 18
+#define NEED_QUADRATIC 6
+#define SURFEL 32 // floats out: centre, radius, normal, u, v, coefficients over the radius from 13, points
+
+__kernel void fit_quartics(int surfels, int padded_surfels, __global const int *center, __global const float *block_radius,
+                           float limit, int padded, __global const float *sorted, __global const float *boxes,
+                           __global const int *node_offset, int top_level, __global float *out, __global float *balls) {
+  int s = get_global_id(0);
+  if (s >= padded_surfels) return;
+  size_t n = padded;
+  int pads = s >= surfels, c = center[pads ? surfels - 1 : s];
+  __global const float *own = sorted + c;
+  float x = own[0], y = own[n], z = own[2 * n], radius = pads ? -1.0f : block_radius[c / 16];
+  if (!pads) {
+    Frame frame = frame_at(own[3 * n], own[4 * n], own[5 * n]), *f = &frame;
+    Sums sums;
+    float most = radius * limit, a[TERMS];
+    while (1) {
+      sum_ball(&sums, f, x, y, z, radius, padded, sorted, boxes, node_offset, top_level);
+      if (sums.count >= NEED || radius * 1.25f > most) break;
+      radius *= 1.25f;
+    }
+    int terms = sums.count >= NEED ? 15 : sums.count >= NEED_CUBIC ? 10 : 6;
+    int known = sums.count >= NEED_QUADRATIC;
+    factorise(&sums, terms);
+    solve(&sums, terms, a);
+    __global float *o = out + SURFEL * (size_t)s;
+    float k[TERMS], parts[13] = {x, y, z, radius, f->nx, f->ny, f->nz, f->ux, f->uy, f->uz, f->vx, f->vy, f->vz};
+    to_monomials(a, k);
+    for (int i = 0; i < 13; ++i) o[i] = parts[i];
+    for (int i = 0; i < TERMS; ++i) o[13 + i] = k[i];
+    o[28] = sums.count;
+    o[29] = o[30] = o[31] = 0.0f;
+    if (!known) radius = -1.0f;
+  }
+  size_t m = padded_surfels;
+  balls[s] = x;
+  balls[m + s] = y;
+  balls[2 * m + s] = z;
+  balls[3 * m + s] = radius;
+}

@@ -1,0 +1,353 @@
+"""Curvature at points: surfaces of known curvature, orders, invariance, odd scans, surfaces, kernels against twins."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import analysis_curvature as twin
+from reference import curved
+
+import clsurf
+from clsurf.analysis import quartics
+from clsurf.analysis.curvature import curvature
+from clsurf.build.point_tree import build_point_tree
+from clsurf.errors import Cancelled, InputError
+from clsurf.surface.cloud import PointCloud
+from clsurf.surface.mesh import Mesh
+
+
+def cloud_of(points, normals):
+    return PointCloud(points, np.asarray(normals, np.float32))
+
+
+def size_of(mean, gaussian):
+    """Root mean square of the larger principal curvature's kind, to measure errors by where H vanishes."""
+    return np.sqrt(np.mean(4 * mean**2 - 2 * gaussian)) or 1.0
+
+
+def rotation(seed=0):
+    q = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return q * np.sign(np.linalg.det(q))
+
+
+# Surfaces of known curvature ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "mean_error", "gaussian_error"), [
+    ("sphere", 5e-5, 7e-5), ("torus", 4e-3, 4e-3), ("ellipsoid", 6e-4, 8e-4), ("catenoid", 3e-3, 8e-3),
+    ("enneper", 2e-3, 6e-3), ("saddle", 3e-5, 5e-5), ("plane", 1e-6, 1e-6)])
+def test_surfaces_of_known_curvature(name, mean_error, gaussian_error, device):
+    points, normals, mean, gaussian = getattr(curved, name)(4000)
+    found = curvature(cloud_of(points, normals), device=device)
+    size = size_of(mean, gaussian)
+    assert np.sqrt(np.mean((found.mean - mean) ** 2)) < mean_error * size
+    assert np.sqrt(np.mean((found.gaussian - gaussian) ** 2)) < gaussian_error * size**2
+    assert np.linalg.norm(found.position - points, axis=1).max() < 2e-4
+    assert np.einsum("ij,ij->i", found.normal, normals).min() > 0.999
+
+
+def test_parts_agree_with_each_other(device):
+    points, normals, _, _ = curved.torus(3000)
+    found = curvature(cloud_of(points, normals), device=device)
+    assert (found.k1 >= found.k2).all()
+    np.testing.assert_allclose(found.k1 + found.k2, 2 * found.mean, atol=1e-5)
+    np.testing.assert_allclose(found.k1 * found.k2, found.gaussian, atol=2e-5)
+    frame = np.stack([found.direction1, found.direction2, found.normal], axis=1)
+    np.testing.assert_allclose(np.linalg.det(frame), 1, atol=1e-5)
+    np.testing.assert_allclose(frame @ frame.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frame.shape), atol=1e-5)
+    for array in vars(found).values():
+        assert array.dtype == np.float64 and not array.flags.writeable
+
+
+def test_principal_directions_of_a_torus(device):
+    points, normals, mean, gaussian = curved.torus(4000)
+    found = curvature(cloud_of(points, normals), device=device)
+    around = np.stack([-points[:, 1], points[:, 0], 0 * points[:, 0]], axis=1)
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    assert np.abs(np.einsum("ij,ij->i", found.direction1, around)).max() < 0.02  # k1 belongs to the tube
+    assert np.abs(np.einsum("ij,ij->i", found.direction2, around)).min() > 0.999
+    apart = np.sqrt(mean**2 - gaussian)
+    np.testing.assert_allclose(found.k1, mean + apart, rtol=0.02)
+
+
+def test_sign_follows_the_normals(device):
+    points, normals, _, _ = curved.torus(2000)
+    out, inside = (curvature(cloud_of(points, sign * normals), device=device) for sign in (1, -1))
+    np.testing.assert_allclose(inside.mean, -out.mean, atol=2e-3)
+    np.testing.assert_allclose(inside.k1, -out.k2, atol=2e-3)
+    np.testing.assert_allclose(inside.gaussian, out.gaussian, atol=1e-2)
+
+
+def test_order_of_convergence(device):
+    errors = []
+    for n in (4000, 16000):
+        points, normals, mean, _ = curved.torus(n)
+        found = curvature(cloud_of(points, normals), radius=20 / np.sqrt(n), device=device)
+        errors.append(np.sqrt(np.mean((found.mean - mean) ** 2)))
+    assert np.log2(errors[0] / errors[1]) > 3.5
+
+
+def test_noise_is_averaged_out_without_a_parameter(device):
+    points, normals, mean, _ = curved.torus(20000)
+    noisy = points + 0.004 * np.random.default_rng(0).normal(size=points.shape)
+    found = curvature(cloud_of(noisy, normals), device=device)
+    assert np.sqrt(np.mean((found.mean - mean) ** 2)) < 0.035 * np.sqrt(np.mean(mean**2))
+    ring = np.hypot(found.position[:, 0], found.position[:, 1]) - 1
+    assert np.std(np.hypot(ring, found.position[:, 2])) < 0.15 * 0.004  # distances to the tube's axis
+
+
+# Invariance --------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 1000), scale=st.floats(-6, 6))
+def test_similarities_carry_over(seed, scale, device):
+    points, normals, mean, gaussian = curved.ellipsoid(1500)
+    turn, scale = rotation(seed), 10.0**scale
+    found = curvature(cloud_of(scale * points @ turn.T, normals @ turn.T), device=device)
+    assert np.sqrt(np.mean((found.mean * scale - mean) ** 2)) < 6e-3
+    assert np.sqrt(np.mean((found.gaussian * scale**2 - gaussian) ** 2)) < 0.015
+
+
+def test_order_of_the_points_does_not_matter(device):
+    points, normals, _, _ = curved.torus(3000)
+    points, normals = points.astype(np.float32), normals.astype(np.float32)
+    order = np.random.default_rng(1).permutation(3000)
+    a = curvature(PointCloud(points, normals), device=device)
+    b = curvature(PointCloud(points[order], normals[order]), device=device)
+    np.testing.assert_array_equal(a.mean[order], b.mean)
+    np.testing.assert_array_equal(a.direction1[order], b.direction1)
+
+
+def test_same_bytes_each_time(device):
+    points, normals, _, _ = curved.torus(3000)
+    a, b = (curvature(cloud_of(points, normals), device=device) for _ in range(2))
+    for name, values in vars(a).items():
+        np.testing.assert_array_equal(values, getattr(b, name))
+
+
+# Odd scans ---------------------------------------------------------------------------------------------------------
+
+
+def test_close_sheets_do_not_mix(device):
+    points, normals, _, _ = curved.sphere(6000, 1.0)
+    shell = np.concatenate([points, 0.985 * points])  # closer than the points of one sheet
+    found = curvature(cloud_of(shell, np.concatenate([normals, -normals])), device=device)
+    np.testing.assert_allclose(found.mean[:6000], 1, atol=2e-3)
+    np.testing.assert_allclose(found.mean[6000:], -1 / 0.985, atol=2e-3)
+
+
+def test_uneven_sampling(device):
+    points, normals, mean, _ = curved.torus(12000)
+    keep = (points[:, 0] > 0) | (np.arange(12000) % 8 == 0)
+    found = curvature(cloud_of(points[keep], normals[keep]), device=device)
+    error = np.abs(found.mean - mean[keep])
+    assert np.sqrt(np.mean(error[points[keep][:, 0] > 0.5] ** 2)) < 8e-3
+    assert np.sqrt(np.mean(error**2)) < 0.25  # an eighth of the points, six spacings around the tube's radius
+
+
+def test_open_rims(device):
+    points, normals, _, _ = curved.sphere(5000, 1.0)
+    cap = points[:, 2] > 0.3
+    found = curvature(cloud_of(points[cap], normals[cap]), device=device)
+    np.testing.assert_allclose(found.mean, 1, atol=0.01)
+
+
+def test_strays_are_unknown_and_harm_nobody(device):
+    points, normals, _, _ = curved.sphere(4000, 1.0)
+    rng = np.random.default_rng(2)
+    strays = rng.normal(size=(20, 3))
+    strays *= rng.uniform(2, 4, (20, 1)) / np.linalg.norm(strays, axis=1, keepdims=True)
+    found = curvature(cloud_of(np.concatenate([points, strays]), np.concatenate([normals, np.eye(3)[[2] * 20]])),
+                      device=device)
+    np.testing.assert_allclose(found.mean[:4000], 1, atol=3e-3)
+    assert np.isnan(found.mean[4000:]).all()
+
+
+def test_points_that_cannot_be_used_are_nan(device):
+    points, normals, _, _ = curved.sphere(1000, 1.0)
+    points, normals = points.astype(np.float32), normals.astype(np.float32)
+    points[3], points[7, 1], normals[11] = np.nan, np.inf, 0
+    found = curvature(PointCloud(points, normals), device=device)
+    assert np.flatnonzero(np.isnan(found.mean)).tolist() == [3, 7, 11]
+    assert np.nanmax(np.abs(found.mean - 1)) < 0.01
+
+
+def test_copies_have_the_curvature_of_their_place(device):
+    points, normals, _, _ = curved.sphere(1000, 1.0)
+    plain = curvature(cloud_of(points, normals), device=device)
+    twice = curvature(cloud_of(np.repeat(points, 3, axis=0), np.repeat(normals, 3, axis=0)), device=device)
+    np.testing.assert_allclose(twice.mean, np.repeat(plain.mean, 3), atol=2e-3)
+
+
+@pytest.mark.parametrize("count", [6, 9, 14, 25, 60])
+def test_tiny_clouds(count, device):
+    points, normals, _, _ = curved.sphere(400, 1.0)
+    points, normals = points[:count] * 2, normals[:count]  # a cap
+    found = curvature(cloud_of(points, normals), device=device)
+    np.testing.assert_allclose(found.mean, 0.5, atol=0.12)
+
+
+def test_missing_normals_are_estimated_outward(device):
+    points, _, mean, _ = curved.torus(3000)
+    found = curvature(PointCloud(points), device=device)
+    assert np.sqrt(np.mean((found.mean - mean) ** 2)) < 0.03
+
+
+def test_meshes_take_their_faces_normals(device):
+    import trimesh
+    ball = trimesh.creation.icosphere(4, 2.0)
+    found = curvature(Mesh(ball.vertices, ball.faces), device=device)
+    np.testing.assert_allclose(found.mean, 0.5, atol=1e-3)
+    inside_out = curvature(Mesh(ball.vertices, ball.faces[:, ::-1]), device=device)
+    np.testing.assert_allclose(inside_out.mean, -0.5, atol=1e-3)
+
+
+def test_survey_coordinates(device):
+    points, normals, _, _ = curved.sphere(1000, 1.0)
+    far = np.array([7_691_239.553, 1_234_567.891, 312.5])
+    found = curvature(PointCloud(points + far, normals.astype(np.float32)), device=device)
+    np.testing.assert_allclose(found.mean, 1, atol=0.01)
+    np.testing.assert_allclose(found.position, points + far, atol=1e-5)
+
+
+@pytest.mark.parametrize(("scan", "says"), [
+    (PointCloud(np.zeros((0, 3))), "at least 6 finite points"),
+    (PointCloud(np.eye(3)), "at least 6 finite points"),
+    (PointCloud(np.full((9, 3), np.nan, np.float32)), "at least 6 finite points"),
+    (PointCloud(np.ones((50, 3), np.float32), np.ones((50, 3))), "at least 6 different points"),
+    (PointCloud(np.eye(3)[[0, 1, 2] * 3].astype(np.float32), np.zeros((9, 3))), "at least 6 different points"),
+    ("nowhere.ply", "nowhere.ply"), (3, "expected a Mesh"), ([], "expected a Mesh")])
+def test_what_has_no_curvature_is_said_in_one_line(scan, says, device):
+    with pytest.raises(InputError, match=says) as error:
+        curvature(scan, device=device)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("options", [{"points": [[0, 0]]}, {"points": [[0, 0, np.nan]]}, {"points": "x"},
+                                     {"radius": 0}, {"radius": -1.0}, {"radius": "large"}, {"radius": np.nan},
+                                     {"radius": True}])
+def test_options_out_of_range(options, device):
+    with pytest.raises(InputError, match=next(iter(options))):
+        curvature(clsurf.models.sphere(100), device=device, **options)
+
+
+def test_points_on_a_line_do_not_fail(device):
+    line = np.linspace(0, 1, 40)[:, None] * (1.0, 2.0, 3.0)
+    found = curvature(PointCloud(line), device=device)
+    assert len(found) == 40 and np.nanmax(np.abs(found.mean), initial=0) < 1e-3
+
+
+def test_progress_can_stop_the_work(device):
+    seen = []
+    curvature(clsurf.models.sphere(500), progress=lambda *step: seen.append(step), device=device)
+    assert seen[0] == ("points", 0.0) and seen[-1] == ("curvature", 1.0)
+    with pytest.raises(Cancelled):
+        curvature(clsurf.models.sphere(500), progress=lambda stage, done: stage != "surfels", device=device)
+
+
+# Elsewhere than at the scan's points, and surfaces -----------------------------------------------------------------
+
+
+def test_given_positions(device):
+    points, normals, _, _ = curved.sphere(4000, 1.0)
+    rng = np.random.default_rng(4)
+    asked = rng.normal(size=(300, 3))
+    asked *= rng.uniform(0.6, 2.0, (300, 1)) / np.linalg.norm(asked, axis=1, keepdims=True)
+    found = curvature(PointCloud(points + 5, normals.astype(np.float32)), asked + 5, device=device)
+    np.testing.assert_allclose(found.mean, 1, atol=1e-3)
+    away = found.position - 5
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), 1, atol=1e-5)
+    outward = asked / np.linalg.norm(asked, axis=1, keepdims=True)
+    assert np.einsum("ij,ij->i", away, outward).min() > 0.999
+    assert len(curvature(PointCloud(points), np.zeros((0, 3)), device=device)) == 0
+
+
+@pytest.mark.parametrize(("degree", "tolerance"), [(2, 0.06), (3, 0.02)])
+def test_slim_surfaces_blend_their_own_surfels(degree, tolerance, device):
+    points, normals, mean, _ = curved.torus(20000)
+    surface = clsurf.build_slim(cloud_of(points, normals), degree=degree, error=0.001, device=device)
+    found = curvature(surface, points[::10], device=device)
+    assert np.sqrt(np.mean((found.mean - mean[::10]) ** 2)) < tolerance * np.sqrt(np.mean(mean**2))
+    np.testing.assert_allclose(found.position, points[::10], atol=1e-3)
+    assert len(curvature(surface, device=device)) == surface.leaf.sum()
+
+
+def test_planes_have_no_curvature(device):
+    surface = clsurf.build_slim(clsurf.models.sphere(500), degree=1, device=device)
+    with pytest.raises(InputError, match="degree=2"):
+        curvature(surface, device=device)
+
+
+def test_placed_surfaces(device):
+    surface = clsurf.build_slim(clsurf.models.torus(5000), degree=3, device=device)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = 3 * rotation(7), (1, 2, 3)
+    asked = curved.torus(200)[0]
+    here = curvature(surface, asked, device=device)
+    there = curvature(surface.moved(matrix), asked @ matrix[:3, :3].T + matrix[:3, 3], device=device)
+    np.testing.assert_allclose(there.mean, here.mean / 3, atol=1e-4)
+    np.testing.assert_allclose(there.gaussian, here.gaussian / 9, atol=1e-4)
+    np.testing.assert_allclose(there.position, here.position @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5)
+    np.testing.assert_allclose(there.normal, here.normal @ rotation(7).T, atol=1e-4)
+
+
+def test_patches_are_measured_at_their_nodes(device):
+    surface = clsurf.models.perfect_sphere()
+    found = curvature(surface, device=device)
+    assert len(found) == surface.opaque.sum()
+    assert np.median(found.mean) * 128 == pytest.approx(1, rel=0.02)
+
+
+# Kernels against twins ---------------------------------------------------------------------------------------------
+
+
+def tree_of(n, device, noise=0.0):
+    points, normals, _, _ = curved.torus(n)
+    points = points + noise * np.random.default_rng(0).normal(size=points.shape)
+    tree = build_point_tree(points.astype(np.float32), normals.astype(np.float32), np.zeros(3, np.float32), 0.25,
+                            device)
+    return tree, device.download(tree.sorted)[:, :tree.count].astype(np.float64)
+
+
+def test_spread_centers(device):
+    tree, host = tree_of(3000, device)
+    spacing = np.where(np.arange(tree.padded // 16) % 3 == 0, 0.03, 0.05).astype(np.float32)
+    centers = quartics.spread_centers(tree, spacing)
+    assert (np.diff(centers) > 0).all()
+    own = spacing[centers // 16]
+    distance = np.linalg.norm(host[:3].T[:, None] - host[:3].T[None, centers], axis=2)
+    assert (distance <= own * 1.0001).any(axis=1).all()  # every point is near a centre
+    between = distance[centers]
+    np.fill_diagonal(between, np.inf)
+    assert between.min() > 0.0299
+
+
+def test_fit_quartics(device):
+    tree, host = tree_of(2000, device, 0.002)
+    radius = np.full(tree.padded // 16, 0.09, np.float32)
+    surfels = quartics.fit_surfels(tree, radius)
+    records = device.download(surfels.records)
+    centers = quartics.spread_centers(tree, quartics.SPACING * radius)
+    assert device.download(surfels.balls)[3, :len(centers)].min() > 0
+    assert (device.download(surfels.balls)[3, len(centers):] == -1).all()
+    for i in range(0, len(centers), 7):
+        wanted = twin.fit_quartics(host, centers[i], float(records[i, 3]))
+        np.testing.assert_allclose(records[i, 13:28], wanted, atol=2e-4 * max(1, np.abs(wanted).max()))
+
+
+def test_point_curvature(device):
+    tree, host = tree_of(2000, device, 0.002)
+    surfels = quartics.fit_surfels(tree, np.full(tree.padded // 16, 0.09, np.float32))
+    out = device.empty((tree.count, 16), np.float32)
+    quartics.evaluate(surfels, tree.sorted, tree.count, tree.padded, device.upload(tree.order), out, 1)
+    rows = device.download(out)
+    records = device.download(surfels.records)[device.download(surfels.balls)[3] > 0].astype(np.float64)
+    for i in range(0, tree.count, 150):
+        wanted = twin.point_curvature(host[:3, i], host[3:6, i], records, 1)
+        got = rows[tree.order[i]]
+        np.testing.assert_allclose(got[:3], wanted["position"], atol=1e-6)
+        np.testing.assert_allclose(got[3:6], wanted["normal"], atol=1e-5)
+        np.testing.assert_allclose(got[6:10], [wanted[k] for k in ("mean", "gaussian", "k1", "k2")], rtol=1e-4,
+                                   atol=2e-3)
+        assert abs(got[10:13] @ wanted["direction1"]) > 0.999
