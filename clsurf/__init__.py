@@ -5,6 +5,7 @@ The public names on one screen; every other name is private to the package.
 
 from . import interrupt  # noqa: F401, I001  first: the other imports take a second
 from . import errors, models
+from .analysis.curvature import Curvature, curvature
 from .analysis.line_strokes import Lines
 from .analysis.lines import line_channels, lines
 from .build.normals import estimate_normals
@@ -31,8 +32,8 @@ from .surface.slim import SlimSurface
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Device", "Error", "Frame", "Lines", "Mesh", "PatchDrawing", "PatchSurface", "Placed", "PointCloud",
-    "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading", "SlimSurface", "build_patches",
-    "build_slim", "errors", "estimate_normals", "line_channels", "lines", "load", "load_frames", "models",
-    "open_device", "project", "render", "report", "save",
+    "Camera", "Curvature", "Device", "Error", "Frame", "Lines", "Mesh", "PatchDrawing", "PatchSurface", "Placed",
+    "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading", "SlimSurface",
+    "build_patches", "build_slim", "curvature", "errors", "estimate_normals", "line_channels", "lines", "load",
+    "load_frames", "models", "open_device", "project", "render", "report", "save",
 ]
