@@ -8,6 +8,7 @@ from . import errors, models
 from .analysis.curvature import Curvature, curvature
 from .analysis.line_strokes import Lines
 from .analysis.lines import line_channels, lines
+from .analysis.smooth import smooth
 from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
@@ -35,5 +36,5 @@ __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Lines", "Mesh", "PatchDrawing", "PatchSurface", "Placed",
     "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading", "SlimSurface",
     "build_patches", "build_slim", "curvature", "errors", "estimate_normals", "line_channels", "lines", "load",
-    "load_frames", "models", "open_device", "project", "render", "report", "save",
+    "load_frames", "models", "open_device", "project", "render", "report", "save", "smooth",
 ]

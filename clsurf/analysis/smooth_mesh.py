@@ -1,0 +1,222 @@
+"""Smoothing of triangle meshes: guide normals, fits at the faces, vertices moved to the blended normals or planes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from ..build.point_tree import BLOCK, build_boxes, column_bounds, morton_order
+from ..device import Device
+from ..device.arrays import DeviceArray
+from ..io.cleaning import first_of_duplicates
+from .smooth_fits import (
+    Queries,
+    Rings,
+    Samples,
+    blended,
+    choose_radii,
+    guided_fits,
+    has_edges,
+    local_size,
+    queries_of,
+)
+
+ROW = 8  # floats a face (guided_planes.cl)
+GUIDE_SHARPS = (1.0, 2.0, 4.0, 4.0, 4.0)  # of the bilateral iterations on normals
+GUIDE_WIDTH = 2.0  # their standard deviation in space, over the edge length
+SHARP, SHARP_CAD = 6.0, 10.0  # of fits and blend; shapes with sharp edges
+RADIUS_CAD = 1.1  # of the chosen radius: flat faces have no bias to be wary of
+MOVES = 10  # steps of vertices toward the blended normals
+RELAX = 0.5  # share of the way to the middle that a vertex at a folded face takes within the surface
+AREA_ROUNDS = 6  # means over neighbours of the faces' areas, whose root is the spacing
+STAYS, SLIDES, MOVES_FREELY = 0, 1, 3  # kinds of vertices (move_vertices.cl)
+
+
+@dataclass(eq=False)
+class Net:
+    """The usable part of a mesh on a device: faces along the Morton curve, vertices in the order of their first use.
+
+    Attributes
+    ----------
+    used : (u,) int64
+        Welded vertex of every vertex of the net.
+    vertices : (u, 3) float32
+        Relative to `middle`, over `unit`.
+    faces : (f, 3) int32
+    """
+
+    device: Device
+    used: NDArray
+    vertices: NDArray
+    faces: NDArray
+    middle: NDArray  # (3,) float64
+    unit: float
+    faces_on_device: DeviceArray
+    offset: DeviceArray  # (u + 1,) int32
+    faces_of: DeviceArray  # (3 f,) int32
+    averaging: sparse.csr_matrix  # (u, f): sums over the faces of a vertex
+    rings: Rings
+    border: NDArray  # (u,) bool: at a face's edge that no other face shares
+
+    def at_faces(self, values: NDArray) -> NDArray:
+        """Return means (f,) of values (u,) over the corners of faces."""
+        return values[self.faces].mean(axis=1)
+
+
+def net_of(points: NDArray, faces: NDArray, device: Device) -> tuple[Net, NDArray] | None:
+    """Return the net of the faces whose corners are finite and three, and the welded index of every vertex.
+
+    None where there is no such face, or all corners are at one place.
+    """
+    first, target = first_of_duplicates(points)
+    faces = target[faces]
+    a, b, c = faces.T
+    good = (a != b) & (b != c) & (c != a)
+    finite = np.isfinite(points[first]).all(axis=1)
+    if not finite.all():
+        good &= finite[faces].all(axis=1)
+    faces = faces if good.all() else faces[good]
+    if not len(faces):
+        return None
+    corners = points if len(first) == len(points) else points[first]
+    inside = np.zeros(len(corners), bool)
+    inside[faces] = True
+    box = column_bounds(corners if inside.all() else corners[inside]).astype(np.float64)
+    unit = float(np.linalg.norm(box[1] - box[0]))
+    if not (np.isfinite(unit) and unit > 0):
+        return None
+    middle = box.mean(axis=0)
+    corners = ((corners - middle) / unit).astype(np.float32)
+    corners[~inside] = 0.0  # may be infinite
+    order, _, _ = morton_order(corners[faces[:, 0]] + corners[faces[:, 1]] + corners[faces[:, 2]], device)
+    faces = faces[order]
+    flat = faces.ravel()
+    place = np.zeros(len(corners), np.int64)
+    place[flat[::-1]] = np.arange(len(flat))[::-1]  # the last write, at the first use, stays
+    used = flat[place[flat] == np.arange(len(flat))]
+    number = np.zeros(len(corners), np.int32)
+    number[used] = np.arange(len(used), dtype=np.int32)
+    return _net(used, np.ascontiguousarray(corners[used]), number[faces], middle, unit, device), target
+
+
+def _net(used, vertices, faces, middle, unit, device) -> Net:
+    count = len(used)
+    rows = sparse.csr_matrix((np.arange(faces.size, dtype=np.int32), faces.ravel(), np.arange(0, faces.size + 1, 3)),
+                             shape=(len(faces), count)).tocsc()
+    corner, offset = rows.data, rows.indptr.astype(np.int32)
+    face = corner // 3
+    following, before = (faces.ravel()[3 * face + (corner + step) % 3] for step in (1, 2))
+    near = np.stack([following, before], axis=1).ravel()
+    # Around an inner vertex every neighbour follows one face's corner and comes before another's: hashes cancel.
+    code = np.random.default_rng(1).integers(1 << 62, size=count).astype(np.uint64)
+    border = np.add.reduceat(code[following] - code[before], offset[:-1]) != 0
+    averaging = sparse.csr_matrix((np.ones(len(face), np.float32), face, offset), shape=(count, len(faces)))
+    rings = Rings(device, count, device.upload(2 * offset), device.upload(near, np.int32))
+    return Net(device, used, vertices, faces, middle, unit, device.upload(faces), device.upload(offset),
+               device.upload(face, np.int32), averaging, rings, border)
+
+
+def guide_rows(net: Net) -> tuple[DeviceArray, NDArray]:
+    """Return rows (f, ROW) of the faces with filtered normals, and the faces' areas."""
+    device, count = net.device, len(net.faces)
+    size = local_size(device)
+    rows, other = device.empty((count, ROW), np.float32), device.empty((count, ROW), np.float32)
+    device.kernel("analysis/guided_planes.cl")((count,), size, count, net.faces_on_device, device.upload(net.vertices),
+                                               1.0, rows)
+    areas = device.download(rows)[:, 3].copy()
+    mean = max(float(areas.mean(dtype=np.float64)), 1e-30)
+    device.kernel("analysis/guided_planes.cl")((count,), size, count, net.faces_on_device, device.upload(net.vertices),
+                                               1.0 / mean, rows)
+    width2 = 2 * GUIDE_WIDTH**2 * edge_length(mean) ** 2
+    for sharp in GUIDE_SHARPS:
+        device.kernel("analysis/guided_normals.cl")((count,), size, count, net.faces_on_device, net.offset,
+                                                    net.faces_of, rows, 1.0 / width2, sharp, other)
+        rows, other = other, rows
+    return rows, areas
+
+
+def edge_length(area):
+    """Return the edge of an equilateral triangle of `area`."""
+    return np.sqrt(4 / np.sqrt(3) * area)
+
+
+def samples_of(net: Net, rows: DeviceArray, spacing: NDArray) -> Samples:
+    """Return the faces' centroids with the normals of `rows`; spacing: (f,)."""
+    device, count = net.device, len(net.faces)
+    padded = -(-count // BLOCK) * BLOCK
+    arrays = device.empty((7, padded), np.float32)
+    device.kernel("analysis/guided_rows.cl")((padded,), local_size(device), count, padded, rows, arrays)
+    boxes, node_offset, top_level = build_boxes(arrays, padded, device)
+    return Samples(device, count, padded, arrays, boxes, node_offset, top_level, spacing, 2.0)
+
+
+def smooth_net(net: Net, method: str, strength: float, kind: NDArray) -> NDArray:
+    """Return smoothed vertices (u, 3) float32 of the net.
+
+    Parameters
+    ----------
+    method : str
+        "normals", "quadrics" or "projection".
+    strength : float
+        Above 1 radii are multiplied by it.
+    kind : (u,) uint8
+        How each vertex may move.
+    """
+    rows, areas = guide_rows(net)
+    degree = np.maximum(np.diff(net.averaging.indptr), 1).astype(np.float32)
+    area = net.rings.means((net.averaging @ areas / degree)[:, None], AREA_ROUNDS)[:, 0]
+    spacing = edge_length(np.maximum(area, 1e-14))
+    samples = samples_of(net, rows, net.at_faces(spacing))
+    normals = net.averaging @ net.device.download(rows, copy=False)[:, :3]
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), (0.0, 0.0, 1.0)).astype(np.float32)
+    queries = queries_of(net.vertices, normals, net.device)
+    sharp, factor = sharpness(samples, queries, net.rings)
+    radii = net.at_faces(factor * spacing) * max(strength, 1.0)
+    fits = guided_fits(samples, radii, sharp)
+    if method == "projection":
+        offset, *normal, _ = blended(fits, queries)
+        return np.where(kind[:, None] > 0, net.vertices - offset[:, None] * np.stack(normal, axis=1), net.vertices)
+    found = blended(fits, Queries(samples.count, samples.padded, samples.sorted))
+    if method == "quadrics":
+        return place_vertices(net, samples, found, kind)
+    return move_vertices(net, found[1:4], kind)
+
+
+def sharpness(samples: Samples, queries: Queries, rings: Rings) -> tuple[float, NDArray]:
+    """Return the sharpness of weights that suits the shape, and the radii (u,) over the spacing chosen with it."""
+    choice = choose_radii(samples, queries, rings, SHARP)
+    if not has_edges(samples, queries, choice):
+        return SHARP, choice.factor
+    return SHARP_CAD, RADIUS_CAD * choose_radii(samples, queries, rings, SHARP_CAD).factor
+
+
+def move_vertices(net: Net, normals: NDArray, kind: NDArray) -> NDArray:
+    """Move vertices so that the faces turn to `normals` (3, f)."""
+    device, count = net.device, len(net.used)
+    wanted = np.zeros((len(net.faces), 4), np.float32)
+    wanted[:, :3] = normals.T
+    wanted, kind = device.upload(wanted), device.upload(kind)
+    start = device.upload(net.vertices)
+    a, b = device.empty((count, 3), np.float32), device.empty((count, 3), np.float32)
+    kernel = device.kernel("analysis/move_vertices.cl")
+    for step in range(MOVES):
+        kernel((count,), local_size(device), count, net.offset, net.faces_of, net.faces_on_device, wanted, kind, RELAX,
+               a if step else start, b)
+        a, b = b, a
+    return device.download(a)
+
+
+def place_vertices(net: Net, samples: Samples, found: NDArray, kind: NDArray) -> NDArray:
+    """Place vertices by quadric minimisation over the planes of the projected centroids."""
+    device, count = net.device, len(net.used)
+    centroid = device.download(samples.sorted, copy=False)[:3, :samples.count]
+    planes = np.empty((len(net.faces), 4), np.float32)
+    planes[:, :3] = found[1:4].T
+    planes[:, 3] = (centroid * found[1:4]).sum(axis=0) - found[0]
+    out = device.empty((count, 3), np.float32)
+    device.kernel("analysis/place_vertices.cl")((count,), local_size(device), count, net.offset, net.faces_of,
+                                                device.upload(planes), device.upload(kind),
+                                                device.upload(net.vertices), out)
+    return device.download(out)
