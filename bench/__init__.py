@@ -9,6 +9,7 @@ import importlib
 JOBS = {
     "build": "scan to SLIM surface: time, size, error, overlap, memory",
     "tiles": "frames: time, time per stage and tile, holes, silhouettes, depth and normals against ray casting",
+    "lines": "feature lines: distance from analytic curves, frames with lines over them",
     "normals": "neighbours, normals and their orientation",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }

@@ -9,6 +9,7 @@ import typer
 from ..errors import InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
 from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
+from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
 
 SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
@@ -63,6 +64,7 @@ def render(source: SourceArgument,
                                                       ".jpg show color.")] = "color,depth,normal",
            shading: LookOption = "phong", supersampling: SamplesOption = 1, lod: LodOption = 4.0,
            nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
+           lines: LinesOption = "", on_white: OnWhiteOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
            quiet: QuietOption = False):
@@ -75,8 +77,9 @@ def render(source: SourceArgument,
     # Every option is checked before the work.
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     wanted = checked_channels(filter(None, channels.split(",")))
-    checked_out(out, PICTURES)
-    if out.suffix.lower() != ".exr" and "color" not in wanted:
+    strokes = line_picture(lines, on_white)
+    checked_out(out, endings(strokes))
+    if out.suffix.lower() not in (".exr", ".svg") and "color" not in wanted:
         raise InputError(f"channels: expected color among them for a {out.suffix} picture, got {channels}: add it, or "
                          "write .exr")
     view = checked_view(direction, up, fov, eye, target, ortho)
@@ -84,7 +87,11 @@ def render(source: SourceArgument,
     looks, lod, drawing = clsurf.Shading(look=shading), checked_lod(lod), checked_drawing(nodes, cells, alpha)
     checked_supersampling(supersampling)
     chosen = clsurf.open_device(device or None)
-    thing = loaded_surface(source, how, chosen, steps)
+    if strokes:
+        thing, coarse = strokes.surfaces(source, how, chosen, steps)
+        wanted = strokes.channels(wanted, coarse is thing)
+    else:
+        thing = loaded_surface(source, how, chosen, steps)
     camera = view.camera(thing, picture_size)
     chosen.profile = Profile() if profile else None
     with steps.step("draw"):
@@ -93,8 +100,11 @@ def render(source: SourceArgument,
     if profile:
         print(chosen.profile)
         chosen.profile = None
-    with steps.step("write"):
-        frame.save(out)
+    if strokes:
+        strokes.save(out, frame, None if coarse is thing else coarse, camera, picture_size, chosen, steps)
+    else:
+        with steps.step("write"):
+            frame.save(out)
     steps.say(f"picture: {out.resolve()}")
 
 
