@@ -5,6 +5,7 @@
 // averaged at a point instead of along a ray), and along the tangent plane towards the query.
 #include "common/lanes.clh"
 #include "build/point_tree.clh"
+#include "build/packet.clh"
 #include "build/polynomial_fit.clh"
 
 #ifndef ALPHA
@@ -14,40 +15,6 @@
 #define ROUNDS 5
 #endif
 #define LEAF 24 // floats a leaf: centre, radius, normal, u, v, coefficients from 13
-
-typedef struct {
-  VF x, y, z;
-} Vectors;
-
-typedef struct {
-  float x, y, z, extent;
-} Sphere;
-
-inline float highest(VF a) {
-  union { VF v; float s[16]; } lanes;
-  lanes.v = a;
-  float m = lanes.s[0];
-  for (int j = 1; j < 16; ++j) m = lanes.s[j] > m ? lanes.s[j] : m;
-  return m;
-}
-
-inline Sphere sphere_around(Vectors p) {
-  Sphere s;
-  s.x = 0.5f * (highest(p.x) - highest(-p.x));
-  s.y = 0.5f * (highest(p.y) - highest(-p.y));
-  s.z = 0.5f * (highest(p.z) - highest(-p.z));
-  VF dx = p.x - s.x, dy = p.y - s.y, dz = p.z - s.z;
-  s.extent = sqrt(highest(dx * dx + dy * dy + dz * dz)) * 1.00001f + 1e-7f;
-  return s;
-}
-
-// Leaves of a block whose balls come within `reach` of a sphere's centre; what pads the last block has no radius.
-inline int16 near_leaves(__global const float *balls, size_t padded, size_t block, Sphere s, float reach) {
-  VF dx = ((__global const VF *)balls)[block] - s.x, dy = ((__global const VF *)(balls + padded))[block] - s.y,
-     dz = ((__global const VF *)(balls + 2 * padded))[block] - s.z;
-  VF r = ((__global const VF *)(balls + 3 * padded))[block];
-  return (dx * dx + dy * dy + dz * dz <= (r + reach) * (r + reach)) & (r > 0.0f);
-}
 
 inline VF height_of(__global const float *k, VF u, VF v) {
   VF h = k[0];
@@ -90,7 +57,7 @@ inline VI nearest_leaves(Vectors p, __global const float *leaves, size_t padded,
     while ((blocks = traversal_next(&t, boxes, node_offset, s.x, s.y, s.z, reach * reach, list)) > 0)
       for (int b = 0; b < blocks; ++b) {
         union { int16 v; int s[16]; } near;
-        near.v = near_leaves(balls, padded, list[b], s, reach);
+        near.v = near_balls(balls, padded, list[b], s, reach);
         for (int j = 0; j < 16; ++j) {
           if (!near.s[j]) continue;
           int i = 16 * list[b] + j;
@@ -141,7 +108,7 @@ inline void blend_at(Vectors q, Vectors facing, __global const float *leaves, si
   while ((blocks = traversal_next(&t, boxes, node_offset, s.x, s.y, s.z, s.extent * s.extent, list)) > 0)
     for (int b = 0; b < blocks; ++b) {
       union { int16 v; int s[16]; } near;
-      near.v = near_leaves(balls, padded, list[b], s, s.extent);
+      near.v = near_balls(balls, padded, list[b], s, s.extent);
       for (int j = 0; j < 16; ++j) {
         if (!near.s[j]) continue;
         __global const float *leaf = leaves + LEAF * (size_t)(16 * list[b] + j), *k = leaf + 13;
