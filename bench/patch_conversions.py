@@ -6,7 +6,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import binary_fill_holes, distance_transform_edt
+from scipy.spatial import cKDTree
 
 from clsurf.build.patches import build_patches
 from clsurf.io import load
@@ -24,6 +25,7 @@ SAMPLES = 20_000  # of a mesh and of its patches that distances are measured fro
 SCANS = {"bunny scans": "range_scans/bunny/bun.conf", "happy scans": "range_scans/happy/happyStandRight.conf",
          "lion": "coloured/lion_takanawa.copc.laz"}
 PICTURE = (500, 500)
+SILHOUETTES = (1500, 1500)
 
 
 def measure(device) -> tuple[dict, dict]:
@@ -59,7 +61,7 @@ def mesh_figures(scene, device, options) -> tuple[dict, object]:
     found = {"build": record.timing(seconds[1:]), "patches": len(surface), "nodes": surface.node_count}
     found |= {key: value for key, value in quality(surface, scene.scan, SAMPLES).items()
               if key in ("rms", "rms_surface", "rms_mesh", "max_vertices", "max_surface")}
-    return found | {"holes": holes(surface, scene, device)}, surface
+    return found | {"holes": holes(surface, scene, device), "overhang": overhang(surface, scene, device)}, surface
 
 
 def holes(surface, scene, device) -> int:
@@ -71,6 +73,29 @@ def holes(surface, scene, device) -> int:
             exact = truth.cast(scene.scan, camera, PICTURE, key=scene.key)
             total += int((binary_fill_holes(drawn) & ~drawn & exact.hit).sum())
     return total
+
+
+def overhang(surface, scene, device) -> float:
+    """Return how far patches reach beyond the mesh's silhouette in eight views, in node spacings there.
+
+    The larger spacing of the patch at the place. Measured in pixels of a 1500x1500 picture, of which one is taken as
+    the pixels' own rounding.
+    """
+    position, patch = surface.positions(), surface.node_patches()[0]
+    shows = np.isfinite(position[:, 0])
+    widest = np.maximum(np.linalg.norm(surface.axis_x, axis=1), np.linalg.norm(surface.axis_y, axis=1))
+    tree, spacing = cKDTree(position[shows]), widest[patch[shows]]
+    worst = 0.0
+    with Renderer(device) as renderer:
+        for camera in views.views(scene.box):
+            frame = renderer.render(surface, camera, SILHOUETTES, channels=("depth", "position"))
+            exact = truth.cast(scene.scan, camera, SILHOUETTES, key=scene.key)
+            beyond = np.where(np.isfinite(frame.depth), distance_transform_edt(~exact.hit) - 1, 0)
+            rows = np.nonzero(beyond > 0)
+            _, near = tree.query(frame.position[rows].astype(np.float64) + frame.origin)
+            pixels = spacing[near] * camera.projection(SILHOUETTES).fx / frame.depth[rows]
+            worst = max(worst, float((beyond[rows] / pixels).max(initial=0)))
+    return worst
 
 
 def cloud_figures(scan, device, **options) -> tuple[dict, object]:
@@ -112,9 +137,10 @@ def first_frame(folder, device) -> dict:
 def show(figures: dict) -> None:
     """Print the figures."""
     print("\nconversions: distances in % of the diagonal; hole pixels in four 500x500 views")
-    print_table(("scan", "s", "patches", "nodes", "RMS", "max of vertices", "holes"),
+    print_table(("scan", "s", "patches", "nodes", "RMS", "max of vertices", "holes", "overhang, nodes"),
                 [(name, f"{f['build']['median_s']:.2f}", f"{f['patches']:,}", f"{f['nodes']:,}", f"{f['rms']:.4f}",
-                  f"{f['max_vertices']:.4f}", f["holes"]) for name, f in figures.items() if "rms" in f])
+                  f"{f['max_vertices']:.4f}", f["holes"], f"{f['overhang']:.2f}")
+                 for name, f in figures.items() if "rms" in f])
     print("\nconversions of points: points within two node spacings of a patch, opaque nodes within two point spacings "
           "of a point")
     print_table(("scan", "points", "s", "patches", "node over point spacing", "points", "nodes"),

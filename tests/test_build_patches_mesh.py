@@ -84,6 +84,21 @@ def test_faces_that_face_away_give_no_heights(device):
         np.testing.assert_allclose(heights[np.isfinite(heights)], 0, atol=1e-6)
 
 
+def test_planes_are_not_carried_on_over_a_fall(device):
+    """Beyond the own faces a node 0.7 steps away keeps their plane, unless the surface bends down before it."""
+    y = [-0.47, 0.47]
+    vertices = np.array([[x, b, z] for x, z in ((-0.47, 0), (0.03, 0), (0.07, -0.3)) for b in y], np.float32)
+    faces = np.array([[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]], np.int32)
+    for count, columns in ((2, 10), (4, 9)):  # the wall is faces 2 and 3
+        mesh = Mesh(vertices, faces[:count])
+        lists = FaceLists(np.arange(count, dtype=np.int32), np.int32([0, count]), np.int32([2]))
+        heights = resample_faces(device, mesh, square_frame(), lists)[0].reshape(17, 17)
+        expected, _ = twin.resample_heights(mesh, square_frame(), lists)
+        np.testing.assert_array_equal(np.isfinite(heights), np.isfinite(expected).reshape(17, 17))
+        assert np.flatnonzero(np.isfinite(heights[8])).max() == columns - 1
+        np.testing.assert_allclose(heights[8, 4:columns], 0, atol=1e-6)
+
+
 def textured(texture, n=9):
     mesh = twin.sheet(lambda x, y: 0.1 * x * y, n)
     return replace(mesh, uv=((mesh.vertices[:, :2] + 1) / 2).astype(np.float32), texture=texture)

@@ -5,7 +5,7 @@ import numpy as np
 from clsurf.build.resample import FaceLists, Frames
 from clsurf.surface.mesh import Mesh
 
-REACH, CARRY, SLOPE_LIMIT, GAP_LIMIT, FLAT_AREA = 1.25, 0.8, 2.0, 1.5, 1e-9
+REACH, CARRY, FALL, SLOPE_LIMIT, GAP_LIMIT, FLAT_AREA = 1.25, 0.8, 1.2, 2.0, 1.5, 1e-9
 
 
 def sheet(height, n=21, half=1.0, **more):
@@ -173,6 +173,10 @@ def _node_height(at, triangles, own, faces):
     if over:
         _, height, f = min(over)
         return height, faces[f]
+    for f in range(len(own), len(triangles)):
+        w, apart2 = nearest_weights(triangles[f], at)
+        if doubled_area(triangles[f]) > FLAT_AREA and apart2 < d2 and -z - w @ triangles[f][:, 2] > FALL:
+            return np.nan, -1
     if any(meets(triangles[k], np.sign(doubled_area(triangles[k])) or 1, CARRY, at) for k in reached):
         return -z, faces[k]
     return np.nan, -1
