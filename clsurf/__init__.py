@@ -29,12 +29,13 @@ from .surface.patch import PatchSurface
 from .surface.placed import Placed
 from .surface.ranges import RangeImage, RangeScan
 from .surface.slim import SlimSurface
+from .trace.hits import Hits, trace
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Lines", "Mesh", "PatchDrawing", "PatchSurface", "Placed",
-    "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading", "SlimSurface",
-    "build_patches", "build_slim", "curvature", "errors", "estimate_normals", "line_channels", "lines", "load",
-    "load_frames", "models", "open_device", "project", "render", "report", "save", "smooth",
+    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
+    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
+    "SlimSurface", "build_patches", "build_slim", "curvature", "errors", "estimate_normals", "line_channels", "lines",
+    "load", "load_frames", "models", "open_device", "project", "render", "report", "save", "smooth", "trace",
 ]

@@ -1,0 +1,85 @@
+"""What can be traced: each kind of surface registers how it is put on a device; rays know no more than `Traced`."""
+
+import threading
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device, DeviceArray
+from ..errors import InputError
+
+CLOSEST, ANY, NEXT = 0, 1, 2  # kernels/trace/ray_walk.clh, MODE
+RAYS_OF_ITEM = 64  # rays that one work-item of a CPU device traces
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A surface on a device, ready for rays in its own frame: frame = (model - center) / unit.
+
+    Parameters
+    ----------
+    center : (3,) float64
+        Model space.
+    unit : float
+        Model length of one unit of the frame.
+    box : (2, 3) float64
+        The surface lies inside; frame. Least above largest: nothing is hit.
+    launch : function
+        ``launch(mode, count, rays, hits)`` enqueues the kernel that fills hits (count, 8) from rays (count, 8), both
+        float32 and in the frame (kernels/trace/ray_walk.clh).
+    """
+
+    center: NDArray
+    unit: float
+    box: NDArray
+    launch: Callable[[int, int, DeviceArray, DeviceArray], None]
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to hit."""
+        return not (self.box[0] <= self.box[1]).all()
+
+
+KINDS: dict[type, Callable[[Device, object], Traced]] = {}
+NOTHING = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]])
+
+
+def register(kind: type):
+    """Make surfaces of `kind` traceable by the decorated function (device, surface) -> Traced."""
+    def enter(prepare):
+        KINDS[kind] = prepare
+        return prepare
+    return enter
+
+
+def items(device: Device, count: int) -> tuple[tuple, tuple, int]:
+    """Return global size, local size and rays of a work-item for `count` rays."""
+    batch = RAYS_OF_ITEM if device.lanes > 1 else 1
+    return (-(-count // batch),), (1 if device.lanes > 1 else 64,), batch
+
+
+_kept = threading.local()
+
+
+def traced(device: Device, surface) -> Traced:
+    """Return `surface` on the device; it stays there while the surface lives.
+
+    Raises
+    ------
+    InputError
+        Something that cannot be traced.
+    DeviceMemoryError
+    """
+    prepare = next((KINDS[kind] for kind in type(surface).__mro__ if kind in KINDS), None)
+    if prepare is None:
+        names = ", ".join(sorted(kind.__name__ for kind in KINDS))
+        raise InputError(f"trace: expected one of {names}, plain or placed, or a scene or list of them, got "
+                         f"{type(surface).__name__}: build a surface from a scan first (clsurf.build_slim, "
+                         "clsurf.build_patches)")
+    uploads = _kept.__dict__.setdefault(id(device), weakref.WeakKeyDictionary())
+    if surface not in uploads:
+        uploads[surface] = prepare(device, surface)
+    return uploads[surface]

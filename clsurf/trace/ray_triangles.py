@@ -1,0 +1,81 @@
+"""Meshes and spatial patches for single rays: triangles in blocks of 16. Kernel: kernels/trace/ray_triangles.cl."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device
+from ..errors import InputError
+from ..surface.mesh import Mesh
+from ..surface.patch import PatchSurface
+from ..surface.patch_mesh import patch_mesh
+from .kinds import NOTHING, Traced, items, register
+from .tree import WIDTH, node_boxes, plant
+
+LARGEST_COUNT = 1 << 27
+MARGIN = 1e-6  # of boxes, frame units: more than the kernel's rounding, as coordinates are at most 1 or so
+FAR = 3.0  # where the triangle of an empty slot lies: outside the frame's box, and without area
+
+
+@register(Mesh)
+def trace_mesh(device: Device, mesh: Mesh) -> Traced:
+    """Put the faces on the device."""
+    return trace_triangles(device, mesh, None)
+
+
+@register(PatchSurface)
+def trace_patches(device: Device, surface: PatchSurface) -> Traced:
+    """Put two triangles for every opaque cell on the device; a hit's primitive is its patch."""
+    patch, i, j = surface.node_patches()
+    m, n = surface.size[patch].T.astype(np.int64)
+    first = np.flatnonzero((i < m - 1) & (j < n - 1))
+    corners = np.stack([first, first + 1, first + m[first], first + m[first] + 1])
+    whole = surface.opaque[corners].all(axis=0)
+    return trace_triangles(device, patch_mesh(surface), np.tile(patch[first[whole]], 2))
+
+
+def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Traced:
+    """Put faces on the device, in a frame around the middle of the used vertices in which the longest side is 1/2 to 1.
+
+    Parameters
+    ----------
+    numbers : (f,) int, optional
+        What a hit's primitive is; by default the face. Faces with a vertex that is not finite are left out.
+
+    Raises
+    ------
+    InputError
+        More faces than a slot's number holds.
+    DeviceMemoryError
+    """
+    if len(mesh.faces) > LARGEST_COUNT:
+        raise InputError(f"mesh: expected at most {LARGEST_COUNT:,} faces to trace, got {len(mesh.faces):,}: split it")
+    bottoms = 16 * -(-len(mesh.faces) // WIDTH) / 15
+    device.check_memory(triangles=int(bottoms * 36 * WIDTH), nodes=int(bottoms * 24 * WIDTH / 15))
+    finite = np.isfinite(mesh.vertices).all(axis=1)
+    kept = np.flatnonzero(finite[mesh.faces].all(axis=1))
+    if not len(kept):
+        return Traced(mesh.origin, 1.0, NOTHING, lambda *_: None)
+    faces = mesh.faces[kept]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces.ravel()] = True
+    points = mesh.vertices[used].astype(np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
+    unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else max(float(np.abs(middle).max()), 1.0)
+    corners = ((mesh.vertices.astype(np.float64) - middle) / unit).astype(np.float32)[faces]
+    below, above = corners.min(axis=1).astype(np.float64) - MARGIN, corners.max(axis=1).astype(np.float64) + MARGIN
+    tree = plant(below, above)
+    blocks = tree.in_slots(corners.reshape(-1, 9), FAR).reshape(-1, WIDTH, 9).transpose(0, 2, 1)
+    order = kept if numbers is None else numbers[kept]
+    arrays = [device.upload(node_boxes(tree, below, above)), device.upload(np.ascontiguousarray(blocks)),
+              device.upload(tree.in_slots(order.astype(np.int32), -1))]
+
+    def launch(mode, count, rays, hits):
+        size, group, batch = items(device, count)
+        device.kernel("trace/ray_triangles.cl", constants={"VW": device.lanes, "MODE": mode})(
+            size, group, count, batch, tree.roots, tree.first_bottom, *arrays, rays, hits)
+
+    half = (high - low) / 2 / unit + 1e-3
+    return Traced(mesh.origin + middle, unit, np.stack([-half, half]), launch)
