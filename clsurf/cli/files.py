@@ -22,10 +22,21 @@ from .recipe import (
 )
 
 
-def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")]):
-    """Say what a file holds: counts, bytes, bounds."""
+def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
+         against: Annotated[Path | None, typer.Option(help="A scan: measure how far its points are from the surface, "
+                                                      "and the surface from its triangles.")] = None,
+         study: Annotated[float | None, typer.Option(help="On a scan: the surfels and numbers that surfaces of degree "
+                                                     "1, 2 and 3 need for this L2 error, a share of the diagonal such "
+                                                     "as 0.0001.")] = None,
+         device: DeviceOption = ""):
+    """Say what a file holds: counts, bytes, bounds; with a scan beside it, the surface's error."""
     import clsurf
     thing = clsurf.load(path)
+    surface = isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface)
+    if against is not None and not surface and not len(getattr(thing, "faces", ())):
+        raise InputError(f"{path}: expected a surface or a mesh to measure against {against}, got points only")
+    if study is not None and surface:
+        raise InputError(f"{path}: expected a scan to study, got a surface ({type(thing).__name__})")
     print(thing)
     low, high = thing.bounds
     print("bounds   " + " to ".join("[" + ", ".join(f"{v:.10g}" for v in corner) + "]" for corner in (low, high)))
@@ -39,6 +50,24 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")]):
     else:
         print("points   " + ", ".join(f"{name} {'yes' if getattr(thing, name, None) is not None else 'no'}"
                                       for name in ("normals", "colors")))
+    if against is not None:
+        _about_error(thing, against, device)
+    if study is not None:
+        from ..analysis.sparsity import sparsity
+        print(sparsity(thing, study, device=device or None).table())
+
+
+def _about_error(surface, scan_path, device) -> None:
+    import clsurf
+
+    from ..analysis.error import error
+    scan = clsurf.load(scan_path)
+    found = error(surface, scan, both=len(getattr(scan, "faces", ())) > 0, device=device or None)
+    for name, one in (("against", found), ("back", found.backward)):
+        if one is not None:
+            what = f"{len(one.distance):,} {'points of ' + scan_path.name if one is found else 'points of the surface'}"
+            print(f"{name:<8} {what}: L2 error {one.rms:.4g} ({one.rms / one.diagonal:.4%} of the diagonal), median "
+                  f"{one.median:.4g}, 99 % within {one.percentile(99):.4g}, max {one.max:.4g}")
 
 
 def _about_slim(surface) -> None:
@@ -46,7 +75,8 @@ def _about_slim(surface) -> None:
     leaves = int(surface.leaf.sum())
     print(f"surfels  {len(surface):,}, of which {leaves:,} leaves on {int(surface.level.max(initial=0))} levels, "
           f"{len(surface.children):,} links")
-    print(f"floats   {FLOATS[surface.degree] * leaves:,} in the leaves, {FLOATS[surface.degree]} a surfel")
+    print(f"floats   {FLOATS[surface.degree] * leaves:,} in the leaves, {FLOATS[surface.degree]} a surfel of degree "
+          f"{surface.degree}")
     error = "T_MDL not stored" if math.isnan(surface.error) else f"T_MDL {surface.error:g}"
     print(f"error    {error}, diagonal {surface.diagonal:g}; bound {_bound(surface)}")
 
