@@ -22,6 +22,7 @@ from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
 from .render.scene import Scene
 from .render.shade import Shading
+from .render.slim_drawing import SlimDrawing
 from .report.page import report
 from .surface.cloud import PointCloud
 from .surface.mesh import Mesh
@@ -36,6 +37,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
     "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimSurface", "build_patches", "build_slim", "curvature", "errors", "estimate_normals", "line_channels", "lines",
-    "load", "load_frames", "models", "open_device", "project", "render", "report", "save", "smooth", "trace",
+    "SlimDrawing", "SlimSurface", "build_patches", "build_slim", "curvature", "errors", "estimate_normals",
+    "line_channels", "lines", "load", "load_frames", "models", "open_device", "project", "render", "report", "save",
+    "smooth", "trace",
 ]

@@ -11,6 +11,7 @@ from clsurf.errors import InputError
 from clsurf.render.camera import Camera
 from clsurf.render.differentials import DIFFERENTIALS
 from clsurf.render.renderer import Renderer
+from clsurf.render.slim_drawing import SlimDrawing
 
 SMALL = (44, 35)  # for the twins, which ask every surfel at every pixel
 SIZE = (90, 70)
@@ -148,6 +149,59 @@ def test_differentials(device, torus, which, oriented):
         else:
             close = np.abs(got - value)[both] < 2e-3 * np.nanmedian(np.abs(value)) + 1e-3 * np.abs(value[both])
         assert close.mean() > 0.99, (name, close.mean())
+
+
+@pytest.fixture(scope="module", params=(1, 2, 3))
+def fine_torus(request):
+    """Surfels so flat that each one whose ball holds a point of the surface may show at that point's pixel."""
+    return fitted(*torus_points(8000), 0.07, request.param, 2.0)
+
+
+@pytest.mark.parametrize("which, oriented, lanes", [(0, True, 16), (1, False, 1), (2, True, 16), (2, False, 16)])
+def test_blend_function(device, fine_torus, which, oriented, lanes):
+    """Derivatives of the blended function, against differences of that function at the pixels' places."""
+    camera, t = cameras()[which], fine_torus
+    surface = leaves(t.centers, t.radii, t.normals, t.coefficients, t.degree, oriented=oriented)
+    with Renderer(device, lanes=lanes) as r:
+        frame, other = (r.render(surface, camera, SMALL, ("depth", "normal", "position", *more),
+                                 slim=SlimDrawing(kind))
+                        for kind, more in (("function", ("mean", "gaussian")), ("separate", ())))
+    assert np.array_equal(frame.depth, other.depth, equal_nan=True)
+    hit = np.isfinite(frame.depth)
+    got = {name: frame.channels[name][hit][::9] for name in ("normal", "position", "mean", "gaussian")}
+    points = (got["position"] + frame.origin).astype(np.float64)
+    facing = np.full(len(points), -1.0 if which == 2 else 1.0)
+    gradient, hessian = twin.function_tensors(surface.degree, surface, camera, points, facing)
+    length = np.linalg.norm(gradient, axis=1)
+    n = gradient / length[:, None]
+    project = np.eye(3) - n[:, :, None] * n[:, None]
+    shape = project @ hessian @ project / length[:, None, None]
+    mean, square = np.trace(shape, axis1=1, axis2=2) / 2, np.einsum("pab,pba->p", shape, shape)
+    # At contours a surfel may turn its front or its back to the eye: there the twin and the kernel may differ.
+    ray = points - camera.eye if camera.height is None else np.broadcast_to(camera.rotation[2], points.shape)
+    plain = np.abs((n * ray).sum(axis=1)) > 0.3 * np.linalg.norm(ray, axis=1)
+    assert plain.mean() > 0.7
+    assert (np.abs((n * got["normal"]).sum(axis=1)) > 1 - 1e-5)[plain].mean() > 0.97
+    for name, value in {"mean": mean, "gaussian": 2 * mean**2 - square / 2}.items():
+        close = np.abs(got[name] - value) < 0.02 * np.abs(value) + 0.02 * np.median(np.abs(value))
+        # Planes pass by points in their balls farther off, and need not show there.
+        assert close[plain].mean() > (0.94 if surface.degree == 1 else 0.97), (name, close[plain].mean())
+
+
+def test_lonely_surfel_is_its_own_blend(device):
+    """With one surfel both sides of equation 8 are the same."""
+    surface, camera = leaves([[0, 0, 0]], [1.0], [[0, 0, 1.0]], K[None], 3), Camera.look_at((1, 1, 3), (0, 0, 0))
+    with Renderer(device) as r:
+        one, two = (r.render(surface, camera, SIZE, ("normal", *SECOND), slim=SlimDrawing(kind))
+                    for kind in ("separate", "function"))
+        with pytest.raises(InputError, match=r"radial_derivative.*separate"):
+            r.render(surface, camera, SIZE, ("radial_derivative",), slim=SlimDrawing("function"))
+        with pytest.raises(InputError, match="SlimDrawing"):
+            r.render(surface, camera, SIZE, slim="function")
+    with pytest.raises(InputError, match="separate, function"):
+        SlimDrawing("right")
+    for name in ("normal", "mean", "gaussian", "k1", "k2", "radial"):
+        assert np.nanmax(np.abs(one.channels[name] - two.channels[name])) < 2e-4, name
 
 
 # Independence ---------------------------------------------------------------------------------------------------------

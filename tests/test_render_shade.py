@@ -50,6 +50,22 @@ def test_shade(device, lanes, camera):
     assert np.abs(frame.color.reshape(-1, 4) - wanted).max() < 2e-4
 
 
+@pytest.mark.parametrize("lanes", LANES)
+@pytest.mark.parametrize("camera", [Camera.look_at((0.4, 1.0, 3.2), (0, 0, 0)),
+                                    Camera.orthographic((1, -2, 3), (0, 0, 0), height=2.4)],
+                         ids=("perspective", "orthographic"))
+def test_reflection_lines(device, lanes, camera):
+    """Lines where the mirrored direction to the eye says, in the surface's own colour, lights or not."""
+    shading = Shading(look="reflection", stripes=5)
+    with Renderer(device, lanes=lanes) as r:
+        frame = r.render(Scene([sphere(300)], LIGHTS), camera, SIZE, shading=shading)
+    hit = np.isfinite(frame.depth)
+    gradient = frame.normal[hit].astype(np.float64) @ camera.rotation.T
+    wanted = twin.reflection_lines(view_floats(camera, SIZE), 5, twin.pixel_centres(SIZE)[hit.ravel()], gradient)
+    assert np.abs(frame.color[..., :3][hit] - wanted[:, None] * to_linear(shading.color)).max() < 2e-4
+    assert 0.3 < (wanted > 0.5).mean() < 0.7
+
+
 def test_headlight_shades_the_visible_side(device):
     """Brightest where the surface faces the eye, and never darker than the ambient light."""
     with Renderer(device) as r:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..surface.slim import SlimSurface
+from .slim_drawing import SlimDrawing
 
 # Values per pixel (0: one) and the order of derivatives that a channel needs; scalars come before vectors.
 DIFFERENTIALS = {"mean": (0, 2), "gaussian": (0, 2), "k1": (0, 2), "k2": (0, 2), "derivative1": (0, 3),
@@ -42,7 +43,7 @@ def field_constants(names, first: int) -> dict[str, int]:
     return out
 
 
-def check_differentials(placed, names, look: str) -> None:
+def check_differentials(placed, names, look: str, drawing: SlimDrawing) -> None:
     """Raise InputError where the surfaces of a scene cannot give the channels of curvature `names`.
 
     `placed` has pairs (surface, matrix).
@@ -56,6 +57,11 @@ def check_differentials(placed, names, look: str) -> None:
     if look.startswith("ball"):
         raise InputError(f"channel {names[0]}: expected the look phong or flat, got {look!r}, which draws "
                          "balls")
+    if drawing.derivatives == "function":
+        if order_of(names) > 2:
+            raise InputError(f"channel {max(names, key=lambda n: DIFFERENTIALS[n][1])}: expected "
+                             'SlimDrawing(derivatives="separate"), got "function", which has no third derivatives')
+        return
     name = max(names, key=lambda n: DIFFERENTIALS[n][1])
     if min(degrees) < order_of(names):
         raise InputError(f"channel {name}: expected surfels of degree {order_of(names)} or more, got degree "

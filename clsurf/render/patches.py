@@ -205,5 +205,5 @@ def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, ou
         upload = replace(upload, nodes=nodes)
         constants |= {"CHANNELS": 3, "COLOR_UNIT": LIT_UNIT}
     if out is not None:
-        constants |= shade_constants(grid, look.shading.look != "flat", tuple(out))
+        constants |= shade_constants(grid, look.shading.look, tuple(out))
     tile_patches(device, scratch, grid, upload, constants, view, projected, number, look, out)

@@ -19,6 +19,7 @@ from .patches import draw_patches, shade_patches, upload_patches
 from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
+from .slim_drawing import SlimDrawing
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 
 # How each kind of surface is put on the device, and drawn into a grid.
@@ -62,7 +63,8 @@ class Renderer:
 
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
-               background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None) -> Frame:
+               background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
+               slim: SlimDrawing | None = None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -94,6 +96,8 @@ class Renderer:
             and 4, of the nearest in depth of the four around it.
         patches : PatchDrawing, optional
             How spatial patches are drawn.
+        slim : SlimDrawing, optional
+            How SLIM surfaces are drawn.
 
         Returns
         -------
@@ -120,10 +124,13 @@ class Renderer:
         patches = PatchDrawing() if patches is None else patches
         if not isinstance(patches, PatchDrawing):
             raise InputError(f"patches: expected a clsurf.PatchDrawing, got {patches!r}")
+        slim = SlimDrawing() if slim is None else slim
+        if not isinstance(slim, SlimDrawing):
+            raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
-        check_differentials(scene.placed, curved, shading.look)
+        check_differentials(scene.placed, curved, shading.look, slim)
         own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
         try:
             # The stages of a frame.
@@ -133,16 +140,16 @@ class Renderer:
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             if at_once:
-                (surface, matrix), look = placed[0], Look(shading, lod, patches)
+                (surface, matrix), look = placed[0], Look(shading, lod, patches, slim)
                 arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
                                        whole, floats, channels)
             else:
                 lamps = self.device.upload(floats)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, lamps, "cost" in channels), number)
+                                            Look(shading, lod, patches, slim, lamps, "cost" in channels), number)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
-                               shading.look != "flat", channels)
+                               shading.look, channels)
             if factor > 1:
                 arrays = average(self.device, arrays, picture, factor, wanted, curved, self._scratch.lanes)
             arrays = {name: self.device.download(array, copy=False) for name, array in arrays.items()}
@@ -161,7 +168,7 @@ class Renderer:
                                                for s, _ in placed)
         colored |= shading.look.startswith("ball")
         # Gouraud shading puts light into the planes' colours.
-        lit = patches.shading == "gouraud" and shading.look != "flat" and "color" in channels
+        lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed)
         layout = Layout(color=(colored or lit) and "color" in channels, id="id" in channels, count="count" in channels,
                         level="level" in channels, lit=lit, differentials=curved)
@@ -242,13 +249,13 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches)
+                                                supersampling, patches, slim)
 
 
 _shared = threading.local()

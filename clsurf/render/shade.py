@@ -9,12 +9,13 @@ from ..errors import InputError
 from ..surface.srgb import to_linear
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
+from .slim_drawing import SlimDrawing
 from .tiles import BIN, Grid, Scratch
 
 CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np.float32), "position": (3, np.float32),
             "id": (0, np.int32), "count": (0, np.int32), "level": (0, np.int32), "cost": (0, np.int32)}
 KINDS = {"headlight": 0, "directional": 1, "point": 2}
-LOOKS = ("phong", "flat", "ball_size", "ball_level")
+LOOKS = ("phong", "flat", "reflection", "ball_size", "ball_level")
 STREAMED_BYTES = 24 << 20  # pictures larger than this are stored past the caches
 SPAN = 128  # pixels of a row of bins that one work-item shades
 
@@ -51,8 +52,9 @@ class Shading:
     Parameters
     ----------
     look : str
-        "phong"; "flat": colours without light; "ball_size", "ball_level": the surfels' balls coloured by size or by
-        level (paper, figures 1 and 7).
+        "phong"; "flat": colours without light; "reflection": reflection lines, level lines of the mirrored direction
+        to the eye that run across the picture (paper, figures 2 and 17; use supersampling); "ball_size",
+        "ball_level": the surfels' balls coloured by size or by level (paper, figures 1 and 7).
     level : int, optional
         With "ball_level": draw the surface as it is built up to this level, the leaves up to there pink and the
         level's internal surfels blue (figure 7); None draws the chosen surfels, coloured by level.
@@ -63,6 +65,8 @@ class Shading:
         Exponent of the highlight (Blinn-Phong).
     model_colors : bool
         Use the colours that a surface carries.
+    stripes : float
+        With "reflection": dark lines on a sphere.
     """
 
     look: str = "phong"
@@ -73,15 +77,18 @@ class Shading:
     specular: float = 0.15
     shininess: int = 40
     model_colors: bool = True
+    stripes: float = 24.0
 
     def __post_init__(self):
         if self.look not in LOOKS:
             raise InputError(f"shading look: expected one of {', '.join(LOOKS)}, got {self.look!r}")
-        checks = [("color", 3), ("ambient", 0), ("diffuse", 0), ("specular", 0), ("shininess", 0)]
+        checks = [("color", 3), ("ambient", 0), ("diffuse", 0), ("specular", 0), ("shininess", 0), ("stripes", 0)]
         for name, count in checks:
             _checked_numbers(name, getattr(self, name), count)
         if self.shininess != int(self.shininess) or not 0 <= self.shininess <= 4096:
             raise InputError(f"shading shininess: expected a whole number from 0 to 4096, got {self.shininess}")
+        if not 0 < self.stripes <= 4096:
+            raise InputError(f"shading stripes: expected a number over 0, at most 4096, got {self.stripes}")
 
 
 def _checked_numbers(name, value, count) -> None:
@@ -101,6 +108,7 @@ class Look:
     shading: Shading
     lod: float
     patches: PatchDrawing
+    slim: SlimDrawing
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
 
@@ -116,7 +124,7 @@ def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
     alpha = back[3] if len(back) == 4 else 1.0
     out = np.zeros(16 + 8 * len(lights), np.float32)
     out[0:3] = to_linear(shading.color)
-    out[3:7] = shading.ambient, shading.diffuse, shading.specular, shading.shininess
+    out[3:8] = shading.ambient, shading.diffuse, shading.specular, shading.shininess, shading.stripes
     out[8:11], out[11] = to_linear(back[:3]) * alpha, alpha
     out[12] = len(lights)
     for i, light in enumerate(lights):
@@ -129,12 +137,12 @@ def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
     return out
 
 
-def shade_constants(grid: Grid, lit: bool, channels) -> dict[str, int]:
+def shade_constants(grid: Grid, look: str, channels) -> dict[str, int]:
     """Return the constants of kernels/render/shade.clh."""
     values = sum(max(CHANNELS[name][0], 1) for name in channels) + grid.layout.differential_planes
     pixels = values * grid.size[0] * grid.size[1]
     return {f"WRITE_{name.upper()}": name in channels for name in ("color", "depth", "normal", "position", "cost")} | {
-        "LIT": lit, "STREAMED": 4 * pixels > STREAMED_BYTES}
+        "LIT": look != "flat", "REFLECTION": look == "reflection", "STREAMED": 4 * pixels > STREAMED_BYTES}
 
 
 def new_channels(device: Device, size: tuple[int, int], channels, differentials: int = 0) -> dict[str, DeviceArray]:
@@ -148,7 +156,7 @@ def new_channels(device: Device, size: tuple[int, int], channels, differentials:
     return out
 
 
-def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps: DeviceArray, lit: bool,
+def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps: DeviceArray, look: str,
           channels) -> dict[str, DeviceArray]:
     """Write the channels of the picture from the grid's planes; return them by name, on the device.
 
@@ -156,7 +164,7 @@ def shade(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, lamps
     """
     width, height = grid.size
     out = new_channels(device, grid.size, channels, grid.layout.differential_planes)
-    constants = grid.layout.constants | {"VW": scratch.lanes, "SPAN": SPAN} | shade_constants(grid, lit, channels)
+    constants = grid.layout.constants | {"VW": scratch.lanes, "SPAN": SPAN} | shade_constants(grid, look, channels)
     items = (width, height) if scratch.lanes == 1 else (-(-width // SPAN), -(-height // BIN))
     unused = scratch.array("unused", (4,), np.float32)
     device.kernel("render/shade.cl", constants=constants)(

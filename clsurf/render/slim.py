@@ -15,6 +15,7 @@ from ..surface.slim import SlimSurface
 from ..surface.slim_bounds import height_bounds, scaled_coefficients
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
 from .shade import Look, Shading
+from .slim_drawing import SlimDrawing
 from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, new_footprints, view_floats
 
 RECORD_FLOATS = 32  # kernels/common/slim.clh
@@ -131,7 +132,7 @@ def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
 
 def surfel_colors(device: Device, upload: SlimUpload, shading: Shading) -> DeviceArray:
     """Return the linear colours (count, 4) float32 that a surface is drawn with."""
-    if shading.look == "phong" or shading.look == "flat":
+    if not shading.look.startswith("ball"):
         if shading.model_colors and upload.colors is not None:
             return upload.colors
         srgb = np.broadcast_to(np.asarray(shading.color, np.float64), (upload.count, 3))
@@ -217,14 +218,15 @@ def project_slim(device: Device, scratch: Scratch, upload: SlimUpload, view: Dev
 
 def tile_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, view: DeviceArray,
               records: DeviceArray, pairs: PairLists, colors: DeviceArray | None, number: int,
-              balls: bool) -> None:
+              balls: bool, drawing: SlimDrawing) -> None:
     """Draw the surfels of every bin into its planes, the paper's two passes, or their balls.
 
     `number` is the surface's place in the scene, for the channel "id".
     """
     constants = grid.layout.constants | {"VW": scratch.lanes, "DEGREE": upload.degree, "TILE_BINS": grid.tile_bins}
     if not balls:
-        constants |= {"ORIENTED": upload.oriented, "HAS_COLOR": colors is not None}
+        constants |= {"ORIENTED": upload.oriented, "HAS_COLOR": colors is not None,
+                      "FUNCTION": drawing.derivatives == "function"}
     group = 64 if scratch.lanes == 1 else 1
     device.kernel("render/tile_balls.cl" if balls else "render/tile_slim.cl", constants=constants)(
         (grid.tile_count * group,), (group,), view, pairs.pairs, pairs.offsets, records,
@@ -248,4 +250,4 @@ def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, 
     pairs = bin_pairs(device, scratch, grid, footprints, upload.count)
     if pairs is not None:
         colors = surfel_colors(device, upload, shading) if balls or grid.layout.color else None
-        tile_slim(device, scratch, grid, upload, view, records, pairs, colors, number, balls)
+        tile_slim(device, scratch, grid, upload, view, records, pairs, colors, number, balls, look.slim)

@@ -25,6 +25,9 @@
 #ifndef TRIES
 #define TRIES 4
 #endif
+#ifndef FUNCTION
+#define FUNCTION 0  // 1: normals and curvature of the blended function in place of blended ones, equation 8, right
+#endif
 #ifndef ORIENTED
 #define ORIENTED 1  // hits from behind are set back in pass 1 and never blended with hits from the front
 #endif
@@ -40,7 +43,7 @@
 typedef struct {
   VF depth, weight, fx, fy, ft, red, green, blue;
   VI nearest, number;
-#if DERIVATIVES
+#if DERIVATIVES || FUNCTION
   VF facing;
   Jet jet;
 #endif
@@ -76,6 +79,10 @@ INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *k
   }
   return n;
 }
+#endif
+
+#if FUNCTION
+#include "render/blend_function.clh"
 #endif
 
 // Records are scattered: asking for all of a bin's at once hides their latency (8.0 -> 6.8 ms of a dragon frame).
@@ -185,6 +192,32 @@ INLINE void blend(PAIRS pairs, int count, uint block, __global const float *reco
   }
 }
 
+#if FUNCTION
+// Put the derivatives of the blended function at the pixels' places where the blended ones are.
+INLINE void use_function(__global const uint2 *pairs, int count, uint quarter, __global const float *records, VF px,
+                         VF py, Blend *best) {
+  Sums weights, functions;
+  clear_sums(&weights);
+  clear_sums(&functions);
+#if VW == 1
+  sum_functions(pairs, count, 1u << quarter, records, px, py, best->depth, best->facing, &weights, &functions);
+#else
+  uint2 kept[SEGMENT];
+  for (int first = 0; first < count; first += SEGMENT) {
+    int n = filtered(pairs + first, count - first < SEGMENT ? count - first : SEGMENT, quarter, kept);
+    sum_functions(kept, n, 0u, records, px, py, best->depth, best->facing, &weights, &functions);
+  }
+#endif
+  VI some = weights.value > 1e-6f;  // a place between the surfels' roots may lie outside all their balls
+  divide_sums(&weights, &functions);
+  best->fx = SEL(best->fx, best->facing * functions.x, some);
+  best->fy = SEL(best->fy, best->facing * functions.y, some);
+  best->ft = SEL(best->ft, best->facing * functions.t, some);
+#define USE_SECOND(d) best->jet.d = SEL(best->jet.d, functions.second.d, some);
+  EACH_SECOND(USE_SECOND)
+}
+#endif
+
 // One block (VW = 1: one pixel) of a bin.
 INLINE int draw_block(__global const float *view, __global const uint2 *pairs, int count, uint quarter,
                       __global const float *records, __global const float4 *colors, __global const int *levels,
@@ -199,7 +232,7 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   best.depth = infinite;
   best.weight = best.fx = best.fy = best.ft = best.red = best.green = best.blue = 1.0f;
   best.nearest = 0; best.number = 0;
-#if DERIVATIVES
+#if DERIVATIVES || FUNCTION
 #define CLEAR_BEST(d) best.jet.d = 0.0f;
   EACH_DERIVATIVE(CLEAR_BEST)
   best.facing = 1.0f;
@@ -223,7 +256,7 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
     Blend sum;
     sum.depth = sum.weight = sum.fx = sum.fy = sum.ft = sum.red = sum.green = sum.blue = 0.0f;
     sum.nearest = 0; sum.number = 0;
-#if DERIVATIVES
+#if DERIVATIVES || FUNCTION
 #define CLEAR_SUM(d) sum.jet.d = 0.0f;
     EACH_DERIVATIVE(CLEAR_SUM)
 #endif
@@ -243,7 +276,7 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
 #if HAS_COLOR
     KEEP(red); KEEP(green); KEEP(blue);
 #endif
-#if DERIVATIVES
+#if DERIVATIVES || FUNCTION
 #define KEEP_DERIVATIVE(d) KEEP(jet.d);
     EACH_DERIVATIVE(KEEP_DERIVATIVE)
     best.facing = SEL(best.facing, ORIENTED ? facing : (VF)(1.0f), found);
@@ -257,6 +290,9 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   if (was_touched && !any_lane(closer)) return cost;
   store_plane(planes, FIELD_DEPTH, at, SEL(before, best.depth, closer));
   if (!any_lane(closer)) return cost;
+#if FUNCTION
+  use_function(pairs, count, quarter, records, px, py, &best);
+#endif
   float fx = view[FX], fy = view[FY];
   VF gx = best.fx * fx, gy = -best.fy * fy;
   VF gz = view[PERSPECTIVE] > 0.0f ? gx * ((px - view[CX]) / fx) + gy * ((view[CY] - py) / fy) - best.ft : -best.ft;

@@ -6,7 +6,7 @@ import numpy as np
 
 from clsurf.surface.slim import frame_of_normals
 
-from .render import K3, K4, K5, K6, K7, K8, K9, RADIUS, T_REF, height, local, opened, ray_poly, ray_root
+from .render import K0, K3, K4, K5, K6, K7, K8, K9, RADIUS, T_REF, height, local, opened, ray_poly, ray_root
 
 
 def local_tensors(degree, records, at):
@@ -56,6 +56,48 @@ def blended_tensors(degree, view, records, normals, pixels, hit, side, oriented)
     cubic = np.einsum("pn,n,pnijk,nia,njb,nkc->pabc", weight, 1 / r**2, third, tangents, tangents, tangents,
                       optimize=True)
     return gradient, hessian, cubic
+
+
+def function_tensors(degree, surface, camera, points, facing, step=1e-3):
+    """Gradients (p, 3) and Hessians (p, 3, 3), world axes, of sum w f / sum w at points (p, 3): equation 8, right.
+
+    By central differences of the function itself. Surfels count where f falls along the camera's ray (`facing` 1) or
+    rises (-1); for a surface that is not oriented f is turned so that it falls, and `facing` is not used.
+    """
+    n = surface.normals.astype(np.float64)
+    axes = np.stack([*(np.asarray(a, np.float64) for a in frame_of_normals(n)), n], axis=1)
+    radii, k = surface.radii.astype(np.float64), np.zeros((len(n), 32))
+    order = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3])[:surface.coefficients.shape[1]]
+    scaled = surface.coefficients * radii[:, None] ** (order - 1)
+    k[:, K0:K0 + min(scaled.shape[1], 6)], k[:, K6:K6 + max(scaled.shape[1] - 6, 0)] = scaled[:, :6], scaled[:, 6:]
+    k[:, K4] /= 2
+    ray = points - camera.eye if camera.height is None else np.broadcast_to(-camera.rotation[2], points.shape)
+
+    def unit(x):
+        return np.einsum("pnj,nij->pni", x[:, None] - surface.centers - surface.origin, axes) / radii[:, None]
+
+    at = unit(points)
+    _, gu, gv = height(degree, k, at[..., 0], at[..., 1])
+    falls = np.einsum("pnij,pj->pn", np.broadcast_to(axes, (len(points), *axes.shape))
+                      * np.stack([-gu, -gv, np.ones_like(gu)], axis=-1)[..., None], ray)
+    sign = np.where(falls < 0, 1.0, -1.0)
+    use = sign == facing[:, None] if surface.oriented else np.ones_like(sign, bool)
+    sign = np.ones_like(sign) if surface.oriented else sign
+
+    def function(x):
+        q = unit(x)
+        g = np.where(use, np.clip(1 - (q**2).sum(axis=-1), 0, None), 0) ** 3
+        f = sign * radii * (q[..., 2] - height(degree, k, q[..., 0], q[..., 1])[0])
+        return (g * f).sum(axis=1) / g.sum(axis=1)
+
+    e = step * np.eye(3)
+    gradient = np.stack([function(points + a) - function(points - a) for a in e], axis=1) / (2 * step)
+    hessian = np.empty((len(points), 3, 3))
+    for i, a in enumerate(e):
+        for j, b in enumerate(e):
+            corners = function(points + a + b) - function(points + a - b) - function(points - a + b)
+            hessian[:, i, j] = (corners + function(points - a - b)) / (4 * step**2)
+    return gradient, hessian
 
 
 def channels(view, gradient, hessian, cubic, pixels):

@@ -326,6 +326,20 @@ def shade(view, shading, pixels, depth, gradient, base):
     return out
 
 
+def reflection_lines(view, stripes, pixels, gradient, dark=0.06, soft=0.1):
+    """Brightness (p,) of reflection lines: level lines of the height of the mirrored direction to the eye."""
+    v = opened(view)
+    eye = np.tile([0.0, 0.0, 1.0], (len(pixels), 1))
+    if v.perspective:
+        eye = np.stack([(v.cx - pixels[:, 0]) / v.fx, (pixels[:, 1] - v.cy) / v.fy, np.ones(len(pixels))], axis=1)
+        eye /= np.linalg.norm(eye, axis=1, keepdims=True)
+    n = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    mirrored = 2 * (n * eye).sum(axis=1, keepdims=True) * n - eye
+    part = np.mod((mirrored[:, 1] + 1) / 2 * stripes, 1)
+    away = np.minimum(part, 1 - part)
+    return dark + (1 - dark) * np.clip((away - 0.25) / soft + 0.5, 0, 1)
+
+
 def pixel_centres(size):
     """(h * w, 2) centres of the pixels, row by row."""
     y, x = np.mgrid[:size[1], :size[0]] + 0.5
