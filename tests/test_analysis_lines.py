@@ -99,7 +99,7 @@ def test_lines_do_not_depend_on_resolution(device):
     """The same curves at twice the size, at twice the pixels."""
     torus = Torus()
     small, large = (clsurf.lines(exact(torus, TORUS_CAMERA, (n, n)), ("contours", "suggestive_contours", "parabolic"),
-                                 detail=20, length=n / 16, device=device) for n in (256, 512))
+                                 detail=20, device=device) for n in (256, 512))
     for kind in small.kinds:
         a, b = small.of(kind), large.of(kind)
         assert abs(2 * a.lengths.sum() - b.lengths.sum()) < 0.1 * b.lengths.sum()
@@ -197,7 +197,7 @@ def test_chains_are_walked_in_order():
     path = np.stack([np.arange(12.0), np.zeros(12)], axis=1)
     weak, short = path + np.array([0, 5]), path[:3] + np.array([0, 9])
     points = np.concatenate([path, ring, weak, short])
-    strength = np.concatenate([np.full(12, 0.5), np.full(20, 3.0), np.full(12, 0.9), np.full(3, 9.0)])
+    strength = np.concatenate([np.full(12, 0.5), np.full(20, 3.0), np.full(12, 0.9), np.full(3, 2.0)])
     strength[4] = 2
     pairs = np.concatenate([np.arange(11)[:, None] + [0, 1], 12 + (np.arange(20)[:, None] + [0, 1]) % 20,
                             32 + np.arange(11)[:, None] + [0, 1], 44 + np.arange(2)[:, None] + [0, 1]])
@@ -245,3 +245,31 @@ def test_frames_that_cannot_be_used(device):
         found.draw(less)
     with pytest.raises(InputError, match="unknown format"):
         found.save("x.pdf")
+
+
+def path(points, depth=1.0, strength=1.0):
+    """Points (n, 4) and the pairs that join them in a row."""
+    n = len(points)
+    return np.stack([*np.asarray(points, float).T, np.full(n, depth), np.full(n, strength)], axis=1), \
+        np.arange(n - 1)[:, None] + [0, 1]
+
+
+def test_gaps_between_ends_that_point_at_each_other_are_closed():
+    x = np.arange(10.0)
+    straight = np.stack([x, 0 * x], axis=1)
+    for shift, depth, count in (((13, 0.5), 1.0, 1), ((19, 0), 1.0, 2), ((13, 6), 1.0, 2), ((13, 0), 1.5, 2)):
+        (a, p), (b, q) = path(straight), path(straight + shift, depth)
+        found = chains(np.concatenate([a, b]), np.concatenate([p, q + 10]), 0, 1, gap=6, steepest=0.1)
+        assert len(found.closed) == count and len(found.points) == 20
+    ring = 10 * np.stack([np.cos(np.linspace(0, 6, 60)), np.sin(np.linspace(0, 6, 60))], axis=1)
+    found = chains(*path(ring)[:1], path(ring)[1], 0, 1, gap=6)
+    assert found.closed.tolist() == [True]
+
+
+def test_a_closed_gap_makes_short_pieces_long_enough():
+    x = np.arange(6.0)
+    pieces = [path(np.stack([x + 8 * i, 0 * x], axis=1)) for i in range(4)]
+    points = np.concatenate([p for p, _ in pieces])
+    pairs = np.concatenate([q + 6 * i for i, (_, q) in enumerate(pieces)])
+    assert len(chains(points, pairs, 0, 20).closed) == 0
+    assert np.diff(chains(points, pairs, 0, 20, gap=4).offset).tolist() == [24]

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, depth_first_order
 
+from .line_gaps import bridges
 from .line_planes import Crossings
 
 
@@ -28,14 +29,19 @@ def cell_segments(crossings: Crossings, contours: bool) -> NDArray:
     edges, points, columns = crossings.edges, crossings.points, crossings.columns
     if len(edges) == 0:
         return np.empty((0, 2), np.int64)
-    number = np.full(2 * columns * (crossings.height + 1) + 2, -1, np.int32)
-    number[edges] = np.arange(len(edges))
+    number = np.empty(2 * columns * (crossings.height + 1) + 2, np.int32)  # undefined but for the edges
+    number[edges] = np.arange(len(edges), dtype=np.int32)
     pixel, down = edges >> 1, edges & 1
     before = pixel - np.where(down, 1, columns)  # the other cell that the edge belongs to
-    cells = np.unique(np.concatenate([pixel, before[before >= 0]]))
+    marks = np.zeros(columns * crossings.height, bool)
+    marks[pixel] = marks[before[before >= 0]] = True
+    cells = np.flatnonzero(marks)
     # Top, left, bottom, right.
-    found = np.stack([number[2 * cells], number[2 * cells + 1], number[2 * (cells + columns)],
-                      number[2 * (cells + 1) + 1]], axis=1)
+    wanted = 2 * cells[:, None] + np.array([0, 1, 2 * columns, 3])
+    found = number[wanted]
+    known = (found >= 0) & (found < len(edges))
+    known[known] = edges[found[known]] == wanted[known]
+    found = np.where(known, found, -1)
     count = (found >= 0).sum(axis=1)
     two, three, four = found[count == 2], found[count == 3], found[count == 4]
     pairs = [two[two >= 0].reshape(-1, 2)]
@@ -59,17 +65,25 @@ def _lengths(points, pairs):
     return np.hypot(d[..., 0], d[..., 1])
 
 
-def chains(points: NDArray, segments: NDArray, peak: float, length: float) -> Chains:
-    """Join segments into polylines; keep those at least `length` pixels long and somewhere as strong as `peak`.
+def chains(points: NDArray, segments: NDArray, peak: float, length: float, gap: float = 0.0,
+           steepest: float = np.inf) -> Chains:
+    """Join segments into polylines; keep those whose strength is somewhere `peak`, and summed along the line `length`.
 
-    No point may belong to more than two segments.
+    So a line of strength 1 must be `length` pixels long, a weaker one longer: short weak lines are noise. Gaps of up to
+    `gap` pixels between lines that go on in the same direction are closed before, unless the depth differs by more than
+    `steepest` a pixel. No point may belong to more than two segments.
     """
     n = len(points)
     if len(segments) == 0:
         return Chains(np.empty((0, 4), np.float32), np.zeros(1, np.int64), np.empty(0, bool))
-    graph = coo_array((np.ones(len(segments), np.int8), (segments[:, 0], segments[:, 1])), shape=(n, n)).tocsr()
-    count, label = connected_components(graph, directed=False)
-    total = np.bincount(label[segments[:, 0]], _lengths(points, segments), count)
+    graph = _symmetric(segments, n)
+    closing = bridges(points, graph, gap, steepest)
+    if len(closing):
+        segments = np.concatenate([segments, closing])
+        graph = _symmetric(segments, n)
+    count, label = connected_components(graph, directed=True, connection="weak")
+    share = _lengths(points, segments) * points[segments, 3].mean(axis=1)
+    total = np.bincount(label[segments[:, 0]], share, count)
     highest = np.full(count, -np.inf)
     np.maximum.at(highest, label, points[:, 3])
     keep = (total >= length) & (highest >= peak)
@@ -88,6 +102,12 @@ def chains(points: NDArray, segments: NDArray, peak: float, length: float) -> Ch
     closed = first_end[lines] == n
     starts = np.where(closed, start[lines], first_end[lines])
     return Chains(*_ordered(points, used, starts), closed)
+
+
+def _symmetric(segments, n: int):
+    """Return the symmetric graph of `segments` between n points."""
+    both = np.concatenate([segments, segments[:, ::-1]])
+    return coo_array((np.ones(len(both), np.int8), (both[:, 0], both[:, 1])), shape=(n, n)).tocsr()
 
 
 def _ordered(points, segments, starts):
@@ -128,12 +148,14 @@ def relaxed(found: Chains, rounds: int) -> NDArray:
     first, last = found.offset[:-1], found.offset[1:] - 1
     before[first] = np.where(found.closed, last, first)
     after[last] = np.where(found.closed, first, last)
-    points = found.points.copy()
+    points, columns = found.points, list(found.points.T.copy())
     held = np.concatenate([first[~found.closed], last[~found.closed]])
     ends = points[held, :3]
     for i in range(4 * rounds):
         # Each of the ends counts as its own neighbour.
-        parts = slice(None) if i < rounds else slice(3, None)
-        points[:, parts] = 0.5 * points[:, parts] + 0.25 * (points[before][:, parts] + points[after][:, parts])
+        parts = range(4) if i < rounds else (3,)
+        for k in parts:
+            columns[k] = 0.5 * columns[k] + 0.25 * (columns[k][before] + columns[k][after])
+    points = np.stack(columns, axis=1)
     points[held, :3] = ends
     return points

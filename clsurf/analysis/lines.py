@@ -18,14 +18,15 @@ from .line_strokes import Lines
 # Thresholds in units of the median |H| (squared for suggestive contours), found on bunny, dragon, Max Planck and lion.
 FIELDS = {
     "suggestive_contours": (Field("radial", "radial_derivative", sines=True, power=2, least=0.6, peak=4.0, full=16.0),),
-    "ridges": (Field("derivative1", "k1", axis="direction1", least=1.5, peak=3.0, full=8.0),),
-    "valleys": (Field("derivative2", "k2", sign=-1, axis="direction2", extremum=-1, least=1.5, peak=3.0, full=8.0),),
-    "crest": (Field("derivative1", "k1", axis="direction1", other="k2", least=1.5, peak=3.0, full=8.0),
-              Field("derivative2", "k2", sign=-1, axis="direction2", extremum=-1, other="k1", least=1.5, peak=3.0,
-                    full=8.0)),
+    "ridges": (Field("derivative1", "k1", axis="direction1", least=1.7, peak=4.0, full=10.0),),
+    "valleys": (Field("derivative2", "k2", sign=-1, axis="direction2", extremum=-1, least=1.7, peak=4.0, full=10.0),),
+    "crest": (Field("derivative1", "k1", axis="direction1", other="k2", least=1.7, peak=4.0, full=10.0),
+              Field("derivative2", "k2", sign=-1, axis="direction2", extremum=-1, other="k1", least=1.7, peak=4.0,
+                    full=10.0)),
     "parabolic": (Field("gaussian", "mean", sign=0, least=0.25, peak=1.0, full=4.0),),
 }
 KINDS = ("contours", *FIELDS)
+GAP_STEEPNESS = 6.0  # pixel footprints of depth per pixel that a gap may bridge
 CONTOUR_LENGTH = 12.0  # pixels; shorter ones are holes and fragments
 CONTOUR_ROUNDS, ROUNDS = 6, 2  # of smoothing along the lines
 MEDIAN_STEP = 4  # every 4th pixel each way gives the median of |H|
@@ -45,7 +46,7 @@ def line_channels(kinds) -> tuple[str, ...]:
 
 
 def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None = None, smoothing: float = 1.3,
-          detail: float = 1.0, length: float = 15.0, device=None) -> Lines:
+          detail: float = 1.0, length: float | None = None, gap: float | None = None, device=None) -> Lines:
     """Find feature lines in a picture, as polylines with sub-pixel vertices.
 
     Parameters
@@ -64,8 +65,11 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
         Standard deviation in pixels, 0 to 2.6, of the Gaussian that smooths the fields; it stops at depth jumps.
     detail : float
         Larger than 1 shows weaker lines, smaller fewer: thresholds are divided by it.
-    length : float
-        Pixels; shorter lines are dropped. Occluding contours: at most 12.
+    length : float, optional
+        Pixels; shorter lines are dropped, and so are weak ones unless accordingly longer; by default 1.5 % of the
+        picture's longer side. Occluding contours: at most 12.
+    gap : float, optional
+        Pixels; shorter gaps in a line are closed; by default 0.6 % of the longer side, at least 3.
     device : None, str or Device
 
     Returns
@@ -83,7 +87,9 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
     """
     kinds = checked_kinds(kinds)
     check_frame("frame", frame, line_channels([kind for kind in kinds if kind != "contours" or silhouette is None]))
-    _check_options(smoothing, detail, length)
+    length = 0.015 * max(frame.size) if length is None else length
+    gap = max(0.006 * max(frame.size), 3.0) if gap is None else gap
+    _check_options(smoothing, detail, length, gap)
     if silhouette is not None:
         check_frame("silhouette", silhouette, ("depth", "normal"))
         if silhouette.size != frame.size:
@@ -93,14 +99,14 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
     planes = LinePlanes(device, frame)
     for number, kind in enumerate(kinds):
         if kind != "contours":
-            parts += [(number, part) for part in _field_lines(planes, kind, silhouette, smoothing, detail, length)]
+            parts += [(number, part) for part in _field_lines(planes, kind, silhouette, smoothing, detail, length, gap)]
     if "contours" in kinds:  # last: the other frame's planes take the place of this one's
         outline = planes if silhouette is None else LinePlanes(device, silhouette)
-        parts.append((kinds.index("contours"), _contours(outline, min(length, CONTOUR_LENGTH))))
+        parts.append((kinds.index("contours"), _contours(outline, min(length, CONTOUR_LENGTH), gap)))
     return _joined(frame, kinds, parts, device)
 
 
-def _field_lines(planes: LinePlanes, kind, silhouette, smoothing, detail, length) -> list[Chains]:
+def _field_lines(planes: LinePlanes, kind, silhouette, smoothing, detail, length, gap) -> list[Chains]:
     """Return the lines of one kind, their strengths from 0 to 1."""
     out = []
     for field in FIELDS[kind]:
@@ -108,19 +114,29 @@ def _field_lines(planes: LinePlanes, kind, silhouette, smoothing, detail, length
         found = planes.field_crossings(field, smoothing, field.least * unit)
         if silhouette is not None:
             found = found.chosen(_shown(silhouette, found.points))
-        joined = chains(found.points, cell_segments(found, contours=False), field.peak * unit, length)
+        pairs = cell_segments(found, contours=False)
+        found.points[:, 3] = np.sqrt(np.clip(found.points[:, 3] / (field.full * unit), 0, 1))
+        joined = chains(found.points, pairs, np.sqrt(field.peak / field.full), length, gap,
+                        GAP_STEEPNESS * footprint(planes.frame))
         points = relaxed(joined, ROUNDS)
-        points[:, 3] = np.sqrt(np.clip(points[:, 3] / (field.full * unit), 0, 1))
         out.append(Chains(points, joined.offset, joined.closed))
     return out
 
 
-def _contours(planes: LinePlanes, length) -> Chains:
+def _contours(planes: LinePlanes, length, gap) -> Chains:
     found = planes.contour_crossings()
-    joined = chains(found.points, cell_segments(found, contours=True), 0.0, length)
-    points = relaxed(joined, CONTOUR_ROUNDS)
-    points[:, 3] = 1
-    return Chains(points, joined.offset, joined.closed)
+    pairs = cell_segments(found, contours=True)
+    found.points[:, 3] = 1
+    joined = chains(found.points, pairs, 0.0, length, gap, GAP_STEEPNESS * footprint(planes.frame))
+    return Chains(relaxed(joined, CONTOUR_ROUNDS), joined.offset, joined.closed)
+
+
+def footprint(frame: Frame) -> float:
+    """Return the median size of a pixel on the surface, world units across the ray; 1 where there is no surface."""
+    p = frame.camera.projection(frame.size)
+    depth = frame.depth[MEDIAN_STEP // 2::MEDIAN_STEP, MEDIAN_STEP // 2::MEDIAN_STEP]
+    depth = depth[np.isfinite(depth)]
+    return (float(np.median(np.abs(depth))) if p.perspective and len(depth) else 1.0) / p.fx
 
 
 def _shown(silhouette: Frame, points):
@@ -182,8 +198,8 @@ def check_frame(name: str, frame, channels) -> None:
                          f"{', '.join(missing)}: ask for them with render(..., channels=clsurf.line_channels(kinds))")
 
 
-def _check_options(smoothing, detail, length) -> None:
+def _check_options(smoothing, detail, length, gap) -> None:
     for name, value, low, high in (("smoothing", smoothing, 0, 2.6), ("detail", detail, 1e-3, 1e3),
-                                   ("length", length, 0, 1e6)):
+                                   ("length", length, 0, 1e6), ("gap", gap, 0, 1e3)):
         if not isinstance(value, int | float | np.number) or not low <= value <= high:
             raise InputError(f"{name}: expected a number from {low:g} to {high:g}, got {value!r}")
