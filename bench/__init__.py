@@ -11,6 +11,7 @@ JOBS = {
     "tiles": "frames: time, time per stage and tile, holes, silhouettes, depth and normals against ray casting",
     "lines": "feature lines: distance from analytic curves, frames with lines over them",
     "normals": "neighbours, normals and their orientation",
+    "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 
