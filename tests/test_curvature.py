@@ -96,6 +96,24 @@ def test_noise_is_averaged_out_without_a_parameter(device):
     assert np.std(np.hypot(ring, found.position[:, 2])) < 0.15 * 0.004  # distances to the tube's axis
 
 
+def test_noise_at_open_rims_stays_bounded(device):
+    points, normals, mean, _ = curved.torus(20000)
+    part = (points[:, 0] > 0.3) | (points[:, 1] > 0.4)
+    noisy = points + 0.004 * np.random.default_rng(0).normal(size=points.shape)
+    found = curvature(cloud_of(noisy[part], normals[part]), device=device)
+    error = (found.mean - mean[part]) / np.sqrt(np.mean(mean**2))
+    assert np.sqrt(np.mean(error**2)) < 0.045 and np.abs(error).max() < 0.6
+
+
+def test_turned_normals_of_noisy_points_do_no_harm(device):
+    points, normals, mean, _ = curved.torus(20000)
+    rng = np.random.default_rng(0)
+    noisy = points + 0.006 * rng.normal(size=points.shape)
+    turned = normals * np.where(rng.random(20000) < 0.05, -1, 1)[:, None]
+    found = curvature(cloud_of(noisy, turned), device=device)
+    assert np.sqrt(np.mean((found.mean - mean) ** 2)) < 0.06 * np.sqrt(np.mean(mean**2))
+
+
 # Invariance --------------------------------------------------------------------------------------------------------
 
 

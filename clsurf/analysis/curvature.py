@@ -200,9 +200,10 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
     device.check_memory(points=48 * len(found.position), values=64 * len(found.position))
     tree = build_point_tree(found.position, found.normals, middle, 1 / unit, device)
     report("points", 1.0)
-    tree, block_radius = _radii(tree, None if radius == "auto" else float(radius) / unit, report)
+    plan = _plan(tree, None if radius == "auto" else float(radius) / unit, report)
+    tree = plan.tree
     report("surfels", 0.0)
-    surfels = fit_surfels(tree, block_radius)
+    surfels = fit_surfels(tree, plan.block_radius, plan.noise)
     report("surfels", 1.0)
     world_middle = middle + scan.origin
     if points is not None:
@@ -216,8 +217,16 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
     return _in_world(values, unit, world_middle)
 
 
-def _radii(tree: PointTree, radius: float | None, report) -> tuple[PointTree, NDArray]:
-    """Return the tree, its normals averaged where the points are noisy, and the surfels' radius in every block."""
+@dataclass(eq=False)
+class _Plan:
+    """How a scan is fitted: its tree, its normals averaged where the points are noisy, and more."""
+
+    tree: PointTree
+    block_radius: NDArray  # (blocks,) float32, of the surfels in every block of 16 points
+    noise: float  # over the point spacing
+
+
+def _plan(tree: PointTree, radius: float | None, report) -> _Plan:
     report("noise", 0.0)
     samples = risk.spread_samples(tree)
     spacing = float(np.median(samples.spacing))
@@ -226,11 +235,11 @@ def _radii(tree: PointTree, radius: float | None, report) -> tuple[PointTree, ND
         tree = risk.with_mean_normals(tree, NORMAL_REACH * spacing)
     report("noise", 0.3)
     if radius is not None:
-        return tree, np.full(tree.padded // BLOCK, radius, np.float32)
+        return _Plan(tree, np.full(tree.padded // BLOCK, radius, np.float32), sigma / spacing)
     fits = risk.two_degree_fits(tree, samples)
     found = RADIUS_RATIO * risk.least_risk_radius(samples, fits, sigma)
     report("noise", 1.0)
-    return tree, risk.block_radii(tree, samples, found)
+    return _Plan(tree, risk.block_radii(tree, samples, found), sigma / spacing)
 
 
 def _near_scan(tree: PointTree, queries: NDArray, device: Device) -> NDArray:

@@ -142,11 +142,13 @@ def least_risk_radius(samples: Samples, fits: Fits, sigma: float, quantity: str 
     if quantity == "curvature":
         scale = scale / fits.radius**4
     near, weight = sample_neighbors(samples)
-    difference2 = (values[0] - values[1]) ** 2
-    usable = (fits.count >= 20) & np.isfinite(difference2)
-    difference2 = np.where(usable, difference2, np.nan)
+    difference = np.abs(values[0] - values[1])
+    usable = (fits.count >= 20) & np.isfinite(difference)
+    difference = np.where(usable, difference, np.nan)
     with np.errstate(invalid="ignore"):
-        mean2 = _mean(difference2[near], weight[..., None])
+        # Of the mean absolute value, as if normally distributed: one crease must not decide for its neighbours (bunny
+        # with 0.2 % noise: median error of the mean curvature 5.9 by the mean square, 5.4 so).
+        mean2 = _mean(difference[near], weight[..., None]) ** 2 * (np.pi / 2)
         risk = np.maximum(mean2 - (high - low) * scale, 0) + low * scale
     risk[~usable] = np.inf
     best = np.where(np.isfinite(risk).any(axis=1), np.argmin(np.where(np.isnan(risk), np.inf, risk), axis=1), 0)
@@ -184,7 +186,7 @@ def block_radii(tree: PointTree, samples: Samples, radius: NDArray) -> NDArray:
 
 
 def with_mean_normals(tree: PointTree, reach: float) -> PointTree:
-    """Return `tree` with normals averaged over `reach` (the tree's unit), within each point's own hemisphere."""
+    """Return `tree` with normals averaged over `reach` (the tree's unit) on each point's own sheet."""
     device = tree.device
     out = device.empty((6, tree.padded), np.float32)
     device.kernel("analysis/average_normals.cl")((tree.padded // BLOCK,), (1,), *tree.arguments, reach, out)

@@ -1,8 +1,13 @@
 // Normals averaged over the points within `reach`, 16 points at a time as lanes; positions are copied.
 //
-// Normals of the other hemisphere are of a sheet behind and count nothing.
+// Where the normals around a point agree as a whole (their mean is longer than COHERENT), all count: noise turns single
+// normals over. Elsewhere two sheets meet, and those of the other hemisphere count nothing.
 #include "common/lanes.clh"
 #include "build/point_tree.clh"
+
+#ifndef COHERENT
+#define COHERENT 0.5f
+#endif
 
 __kernel void average_normals(int padded, __global const float *sorted, __global const float *boxes,
                               __global const int *node_offset, int top_level, float reach, __global float *out) {
@@ -11,7 +16,7 @@ __kernel void average_normals(int padded, __global const float *sorted, __global
   if (b >= n16) return;
   __global const float16 *own = (__global const float16 *)sorted + b;
   float16 x = own[0], y = own[n16], z = own[2 * n16], nx = own[3 * n16], ny = own[4 * n16], nz = own[5 * n16];
-  float16 sx = 0.0f, sy = 0.0f, sz = 0.0f;
+  float16 sx = 0.0f, sy = 0.0f, sz = 0.0f, ox = 0.0f, oy = 0.0f, oz = 0.0f, weight = 0.0f;
   float low[3], high[3];
   for (int a = 0; a < 3; ++a) {
     __global const float *p = sorted + (size_t)a * padded + 16 * (size_t)b;
@@ -36,11 +41,22 @@ __kernel void average_normals(int padded, __global const float *sorted, __global
         float16 dx = p[0] - x, dy = p[padded] - y, dz = p[2 * (size_t)padded] - z;
         float px = p[3 * (size_t)padded], py = p[4 * (size_t)padded], pz = p[5 * (size_t)padded];
         float16 g = 1.0f - (dx * dx + dy * dy + dz * dz) * inverse;
-        g = SEL((float16)0.0f, g, (g > 0.0f) & (nx * px + ny * py + nz * pz > 0.0f));
-        sx += g * px;
-        sy += g * py;
-        sz += g * pz;
+        g = SEL((float16)0.0f, g, g > 0.0f);
+        weight += g;
+        float16 own_side = SEL((float16)0.0f, g, nx * px + ny * py + nz * pz > 0.0f);
+        g -= own_side;
+        sx += own_side * px;
+        sy += own_side * py;
+        sz += own_side * pz;
+        ox += g * px;
+        oy += g * py;
+        oz += g * pz;
       }
+  float16 ax = sx + ox, ay = sy + oy, az = sz + oz, least = COHERENT * weight;
+  int16 agree = ax * ax + ay * ay + az * az > least * least;
+  sx = SEL(sx, ax, agree);
+  sy = SEL(sy, ay, agree);
+  sz = SEL(sz, az, agree);
   float16 length2 = sx * sx + sy * sy + sz * sz;
   int16 good = length2 > 1e-12f;
   float16 k = 1.0f / VSQRT(SEL((float16)1.0f, length2, good));

@@ -12,7 +12,7 @@
 #define SURFEL 32 // floats out: centre, radius, normal, u, v, coefficients over the radius from 13, points
 
 __kernel void fit_quartics(int surfels, int padded_surfels, __global const int *center, __global const float *block_radius,
-                           float limit, int padded, __global const float *sorted, __global const float *boxes,
+                           float limit, float ridge3, float ridge4, int padded, __global const float *sorted, __global const float *boxes,
                            __global const int *node_offset, int top_level, __global float *out, __global float *balls) {
   int s = get_global_id(0);
   if (s >= padded_surfels) return;
@@ -31,6 +31,8 @@ __kernel void fit_quartics(int surfels, int padded_surfels, __global const int *
     }
     int terms = sums.count >= NEED ? 15 : sums.count >= NEED_CUBIC ? 10 : 6;
     int known = sums.count >= NEED_QUADRATIC;
+    for (int i = 6; i < terms; ++i) // a term of degree 3 or 4 that the points hardly show would be noise
+      sums.gram[i * (i + 1) / 2 + i] += (i < 10 ? ridge3 : ridge4) * sums.gram[0];
     factorise(&sums, terms);
     solve(&sums, terms, a);
     __global float *o = out + SURFEL * (size_t)s;

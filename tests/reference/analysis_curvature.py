@@ -49,12 +49,13 @@ def sample_fits(sorted_points, center, radius):
 
 
 def average_normals(sorted_points, reach):
-    """Return normals (3, n) averaged over `reach` within each one's hemisphere."""
+    """Return normals (3, n) averaged over `reach`, within each one's hemisphere where they disagree as a whole."""
     x, n = sorted_points[:3].T, sorted_points[3:6].T
     out = np.zeros_like(n)
     for i in range(len(x)):
-        g = np.maximum(1 - ((x - x[i]) ** 2).sum(axis=1) / reach**2, 0) * (n @ n[i] > 0)
-        out[i] = g @ n
+        g = np.maximum(1 - ((x - x[i]) ** 2).sum(axis=1) / reach**2, 0)
+        agree = np.linalg.norm(g @ n) > 0.5 * g.sum()
+        out[i] = (g if agree else g * (n @ n[i] > 0)) @ n
     return (out / np.linalg.norm(out, axis=1, keepdims=True)).T
 
 
