@@ -5,10 +5,13 @@ The public names on one screen; every other name is private to the package.
 
 from . import interrupt  # noqa: F401, I001  first: the other imports take a second
 from . import errors, models
+from .analysis.color_maps import color_map
 from .analysis.curvature import Curvature, curvature
+from .analysis.error import SurfaceError, error
 from .analysis.line_strokes import Lines
 from .analysis.lines import line_channels, lines
 from .analysis.smooth import smooth
+from .analysis.sparsity import slim_of_error, sparsity
 from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
@@ -37,7 +40,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
     "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "build_patches", "build_slim", "curvature", "errors", "estimate_normals",
-    "line_channels", "lines", "load", "load_frames", "models", "open_device", "project", "render", "report", "save",
-    "smooth", "trace",
+    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
+    "errors", "estimate_normals", "line_channels", "lines", "load", "load_frames", "models", "open_device", "project",
+    "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
 ]
