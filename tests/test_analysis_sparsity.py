@@ -8,7 +8,7 @@ import pytest
 from clsurf import models
 from clsurf.analysis.error import error
 from clsurf.analysis.sparsity import slim_of_error, sparsity
-from clsurf.errors import InputError
+from clsurf.errors import Cancelled, InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.slim import FLOATS
 
@@ -65,3 +65,8 @@ def test_target_out_of_reach(device):
 def test_sparsity_refuses(options, says, device):
     with pytest.raises(InputError, match=says):
         sparsity(models.sphere(100), device=device, **options)
+
+
+def test_sparsity_stops_when_told_to(device):
+    with pytest.raises(Cancelled):
+        sparsity(models.sphere(100), progress=lambda stage, done: False, device=device)

@@ -13,7 +13,7 @@ import numpy as np
 from ..build.normals import estimate_normals
 from ..build.slim import build_slim, face_normals
 from ..device import open_device
-from ..errors import InputError
+from ..errors import Cancelled, InputError
 from ..io import load
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
@@ -98,13 +98,20 @@ def sparsity(scan, target: float = 1e-4, degrees=(1, 2, 3), curve=CURVE, progres
     curve : sequence of float
         T_MDL of further surfaces to measure, for L2 error over leaves and floats; empty for none.
     progress : callable, optional
-        Called as progress(stage, done); returning False stops.
+        Called as progress(stage, done); returning False stops the study.
     device : None, str or Device
+
+    Returns
+    -------
+    SparsityStudy
+        The same scan gives the same study on one device.
 
     Raises
     ------
     InputError
         As `build_slim`, or a target or degrees out of range.
+    Cancelled
+        `progress` returned False.
     """
     if not 0 < target < 1:
         raise InputError(f"target: expected a share of the diagonal between 0 and 1, got {target!r}")
@@ -113,8 +120,8 @@ def sparsity(scan, target: float = 1e-4, degrees=(1, 2, 3), curve=CURVE, progres
     scan, device = _with_normals(scan, device), open_device(device)
     needed, curves = {}, {}
     for k, degree in enumerate(degrees):
-        if progress is not None:
-            progress(f"degree {degree}", k / len(degrees))
+        if progress is not None and progress(f"degree {degree}", k / len(degrees)) is False:
+            raise Cancelled("sparsity: stopped by the progress callback")
         found = {t: _measured(scan, degree, t, device)[0] for t in sorted(curve)}
         needed[degree] = _search(scan, degree, target, device, found)[0]
         curves[degree] = [found[t] for t in sorted(curve)]
@@ -122,7 +129,21 @@ def sparsity(scan, target: float = 1e-4, degrees=(1, 2, 3), curve=CURVE, progres
 
 
 def slim_of_error(scan, target: float = 1e-4, degree: int = 2, device=None) -> tuple[SlimSurface, Sparseness]:
-    """Return the sparsest SLIM surface whose L2 error over the diagonal is at most `target`, and its figures.
+    """Return the sparsest SLIM surface whose L2 error is at most `target`, and its figures.
+
+    Parameters
+    ----------
+    scan : Mesh, PointCloud, RangeScan or path
+    target : float
+        L2 error over the diagonal; 1e-4 is the paper's 0.01 %.
+    degree : int
+        1, 2 or 3.
+    device : None, str or Device
+
+    Returns
+    -------
+    surface : SlimSurface
+    figures : Sparseness
 
     Raises
     ------
