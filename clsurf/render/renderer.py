@@ -21,6 +21,7 @@ from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
+from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches)}
@@ -135,7 +136,8 @@ class Renderer:
         try:
             # The stages of a frame.
             placed, origin = scene.placed, scene_origin(scene)
-            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface)
+            traced = wants_traced_light(shading, channels)
+            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not traced
             grid = self._new_grid(placed, size, channels, curved, shading, patches, planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
@@ -148,6 +150,8 @@ class Renderer:
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
                                             Look(shading, lod, patches, slim, lamps, "cost" in channels), number)
+                if traced:
+                    light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
                                shading.look, channels)
             if factor > 1:
@@ -170,6 +174,7 @@ class Renderer:
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed)
+        lit |= wants_traced_light(shading, channels)
         layout = Layout(color=(colored or lit) and "color" in channels, id="id" in channels, count="count" in channels,
                         level="level" in channels, lit=lit, differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]

@@ -67,6 +67,14 @@ class Shading:
         Use the colours that a surface carries.
     stripes : float
         With "reflection": dark lines on a sphere.
+    shadows : bool
+        With "phong": the scene's lights throw hard shadows, but for a headlight, which has none. SLIM surfaces throw
+        them; all surfaces receive them.
+    occlusion : int
+        With "phong": directions above a surface along which ambient occlusion looks for SLIM surfaces (32 to 256); the
+        part of them that is open multiplies `ambient`, so give that more weight. 0: none.
+    occlusion_reach : float, optional
+        How far ambient occlusion looks, world units; by default a quarter of the scene's diagonal.
     """
 
     look: str = "phong"
@@ -77,7 +85,10 @@ class Shading:
     specular: float = 0.15
     shininess: int = 40
     model_colors: bool = True
-    stripes: float = 24.0
+    stripes: float = 6.0
+    shadows: bool = False
+    occlusion: int = 0
+    occlusion_reach: float | None = None
 
     def __post_init__(self):
         if self.look not in LOOKS:
@@ -89,6 +100,11 @@ class Shading:
             raise InputError(f"shading shininess: expected a whole number from 0 to 4096, got {self.shininess}")
         if not 0 < self.stripes <= 4096:
             raise InputError(f"shading stripes: expected a number over 0, at most 4096, got {self.stripes}")
+        if not isinstance(self.occlusion, int | np.integer) or not 0 <= self.occlusion <= 1024:
+            raise InputError("shading occlusion: expected a whole number of directions from 0 to 1024, got "
+                             f"{self.occlusion!r}")
+        if self.occlusion_reach is not None:
+            _checked_numbers("occlusion_reach", self.occlusion_reach, 0)
 
 
 def _checked_numbers(name, value, count) -> None:

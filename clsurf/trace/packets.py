@@ -48,3 +48,33 @@ def trace_pixels(device: Device, lanes: int, traced: TracedSlim, view: DeviceArr
     device.kernel("trace/trace_pixels.cl", constants=constants)(
         *work_items(lanes, bins_x, bins_y), view, traced.boxes, traced.balls, tree.roots, tree.first_bottom,
         traced.surfels, traced.tails, view if colors is None else colors, number, bins_x, bins_y, touched, planes)
+
+
+def trace_lights(device: Device, lanes: int, traced: TracedSlim, view: DeviceArray, layout: dict[str, int],
+                 lamps: DeviceArray, lamp_count: int, reach: float, fresh: bool, bins_x: int, bins_y: int,
+                 touched: DeviceArray, planes: DeviceArray, mask: DeviceArray, stride: int = 64,
+                 offset: int = 0) -> None:
+    """Set the bits of the lamps that the points of a picture do not see because of one surface.
+
+    Parameters
+    ----------
+    view : (32,) float32
+        The surface that throws the shadow, placed, seen by the picture's camera.
+    lamps : (lamp_count, 8) float32
+        Kind (0: at the eye, 1: directional, 2: point), then the direction to the lamp or its place, in view space;
+        at most 32.
+    reach : float
+        World units: what lies farther than this before a point does not count; inf: everything counts.
+    fresh : bool
+        Whether the mask holds nothing yet.
+    planes : (bins, FIELDS, 64) float32
+        Depth and normals of the points.
+    mask : uint32
+        Bit l of word ``bin * stride + offset + pixel`` is lamp l's. Points that face away from a lamp keep 0.
+    """
+    tree = traced.tree
+    constants = {**layout, **traced.constants, "VW": lanes, "TILE_BINS": TILE_BINS}
+    device.kernel("trace/trace_lights.cl", constants=constants)(
+        *work_items(lanes, bins_x, bins_y), view, traced.boxes, traced.cones, tree.roots, tree.first_bottom,
+        traced.surfels, traced.tails, lamps, lamp_count, reach, int(fresh), bins_x, bins_y, touched, planes, mask,
+        stride, offset)

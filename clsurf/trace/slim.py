@@ -3,6 +3,8 @@
 Kernels: kernels/trace/packet.clh. Source of the surface: Ohtake, Belyaev, Alexa, SGP 2005, section 2.
 """
 
+import threading
+import weakref
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,6 +117,17 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
         device.upload(planes.reshape(-1, WIDTH, SURFEL_FLOATS).transpose(0, 2, 1).astype(np.float32)),
         device.upload(tails), None if colors is None else device.upload(colors), surface.origin, center,
         float((np.linalg.norm(points - center, axis=1) + radii[at]).max()) if len(points) else 0.0)
+
+
+_kept = threading.local()
+
+
+def kept_traced(device: Device, surface: SlimSurface) -> TracedSlim:
+    """Return `upload_traced` of a surface, made on this thread's first use and kept while the surface lives."""
+    uploads = _kept.__dict__.setdefault(id(device), weakref.WeakKeyDictionary())
+    if surface not in uploads:
+        uploads[surface] = upload_traced(device, surface)
+    return uploads[surface]
 
 
 def _leaves(surface: SlimSurface) -> SlimSurface:
