@@ -8,6 +8,7 @@ import typer
 
 from ..errors import InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
+from .color_maps import ChannelOption, LegendOption, LimitOption, channel_picture
 from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
@@ -20,7 +21,7 @@ CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quad
 AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, up to half "
                                            "their alpha.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
-LookOption = Annotated[str, typer.Option(help="phong, flat; slim: ball_size, ball_level.")]
+LookOption = Annotated[str, typer.Option(help="phong, flat, reflection (lines); slim: ball_size, ball_level.")]
 
 
 def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg, .exr.")] = Path("clsurf-demo.png"),
@@ -60,10 +61,12 @@ def render(source: SourceArgument,
            out: Annotated[Path, typer.Argument(help="Picture: .png, .jpg, or .exr with every channel.")],
            size: SizeOption = "1024x768", direction: DirectionOption = "", up: UpOption = "0,1,0",
            fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
-           channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id; .png and "
-                                                      ".jpg show color.")] = "color,depth,normal",
+           channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id, and "
+                                                      "those of --channel; .png and .jpg show "
+                                                      "color.")] = "color,depth,normal",
            shading: LookOption = "phong", supersampling: SamplesOption = 1, lod: LodOption = 4.0,
            nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
+           channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
@@ -77,7 +80,7 @@ def render(source: SourceArgument,
     # Every option is checked before the work.
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     wanted = checked_channels(filter(None, channels.split(",")))
-    strokes = line_picture(lines, on_white)
+    strokes, colored = line_picture(lines, on_white), channel_picture(channel, legend, limit, lines, out)
     checked_out(out, endings(strokes))
     if out.suffix.lower() not in (".exr", ".svg") and "color" not in wanted:
         raise InputError(f"channels: expected color among them for a {out.suffix} picture, got {channels}: add it, or "
@@ -86,6 +89,8 @@ def render(source: SourceArgument,
     how = recipe(kind, degree, error, patches=patches, spacing=spacing)
     looks, lod, drawing = clsurf.Shading(look=shading), checked_lod(lod), checked_drawing(nodes, cells, alpha)
     checked_supersampling(supersampling)
+    if colored:
+        colored.prepared(how, degree)
     chosen = clsurf.open_device(device or None)
     if strokes:
         thing, coarse = strokes.surfaces(source, how, chosen, steps)
@@ -95,8 +100,11 @@ def render(source: SourceArgument,
     camera = view.camera(thing, picture_size)
     chosen.profile = Profile() if profile else None
     with steps.step("draw"):
-        frame = clsurf.render(thing, camera, picture_size, wanted, looks, lod, device=chosen,
-                              supersampling=supersampling, patches=drawing)
+        if colored:
+            frame = colored.draw(thing, camera, picture_size, looks, lod, supersampling, drawing, chosen)
+        else:
+            frame = clsurf.render(thing, camera, picture_size, wanted, looks, lod, device=chosen,
+                                  supersampling=supersampling, patches=drawing)
     if profile:
         print(chosen.profile)
         chosen.profile = None

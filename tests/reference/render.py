@@ -326,7 +326,7 @@ def shade(view, shading, pixels, depth, gradient, base):
     return out
 
 
-def reflection_lines(view, stripes, pixels, gradient, dark=0.06, soft=0.1):
+def reflection_lines(view, stripes, pixels, gradient, dark=0.06, soft=0.05):
     """Brightness (p,) of reflection lines: level lines of the height of the mirrored direction to the eye."""
     v = opened(view)
     eye = np.tile([0.0, 0.0, 1.0], (len(pixels), 1))
