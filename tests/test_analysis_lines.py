@@ -212,6 +212,7 @@ def test_chains_are_walked_in_order():
         line = found.points[found.offset[i]:found.offset[i + 1], :2]
         step = np.linalg.norm(np.diff(line, axis=0), axis=1)
         assert np.allclose(step, 1 if len(line) == 12 else 10 * np.sin(np.pi / 20), atol=1e-5)
+    assert chains(both, pairs, peak=1.0, length=5, ring=20).closed.tolist() == [False]
     smooth = relaxed(found, 3)
     assert np.abs(smooth - found.points)[:, :2].max() < 0.5
     straight = smooth[found.offset[np.argmin(found.closed)]:][:12] if not found.closed[0] else smooth[20:32]

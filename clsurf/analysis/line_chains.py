@@ -66,12 +66,12 @@ def _lengths(points, pairs):
 
 
 def chains(points: NDArray, segments: NDArray, peak: float, length: float, gap: float = 0.0,
-           steepest: float = np.inf) -> Chains:
+           steepest: float = np.inf, ring: float = 1.0) -> Chains:
     """Join segments into polylines; keep those whose strength is somewhere `peak`, and summed along the line `length`.
 
     So a line of strength 1 must be `length` pixels long, a weaker one longer: short weak lines are noise. Gaps of up to
     `gap` pixels between lines that go on in the same direction are closed before, unless the depth differs by more than
-    `steepest` a pixel. No point may belong to more than two segments.
+    `steepest` a pixel. Closed lines need `ring` times the length. No point may belong to more than two segments.
     """
     n = len(points)
     if len(segments) == 0:
@@ -86,7 +86,9 @@ def chains(points: NDArray, segments: NDArray, peak: float, length: float, gap: 
     total = np.bincount(label[segments[:, 0]], share, count)
     highest = np.full(count, -np.inf)
     np.maximum.at(highest, label, points[:, 3])
-    keep = (total >= length) & (highest >= peak)
+    open_line = np.zeros(count, bool)
+    open_line[label[np.diff(graph.indptr) == 1]] = True
+    keep = (total >= length * np.where(open_line, 1.0, ring)) & (highest >= peak)
     used = segments[keep[label[segments[:, 0]]]]
     if len(used) == 0:
         return Chains(np.empty((0, 4), np.float32), np.zeros(1, np.int64), np.empty(0, bool))

@@ -27,6 +27,7 @@ FIELDS = {
 }
 KINDS = ("contours", *FIELDS)
 GAP_STEEPNESS = 6.0  # pixel footprints of depth per pixel that a gap may bridge
+RING = 3.0  # closed lines must be this many times longer: bumps of noise are ringed
 CONTOUR_LENGTH = 12.0  # pixels; shorter ones are holes and fragments
 CONTOUR_ROUNDS, ROUNDS = 6, 2  # of smoothing along the lines
 MEDIAN_STEP = 4  # every 4th pixel each way gives the median of |H|
@@ -53,7 +54,7 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
     ----------
     frame : Frame
         With the channels `line_channels(kinds)`, from a surface of degree 3 for the kinds that need third derivatives:
-        all but "contours" and "parabolic". A coarse surface (error 0.01 to 0.02) gives the cleaner lines.
+        all but "contours" and "parabolic". A coarse surface (error 0.02 to 0.05) gives the cleaner lines.
     kinds : str or sequence of str
         "contours" (occluding: where the surface seen ends), "suggestive_contours" (where the radial curvature changes
         its sign), "ridges" (maxima of k1 along its direction), "valleys" (minima of k2), "crest" (those of both where
@@ -117,7 +118,7 @@ def _field_lines(planes: LinePlanes, kind, silhouette, smoothing, detail, length
         pairs = cell_segments(found, contours=False)
         found.points[:, 3] = np.sqrt(np.clip(found.points[:, 3] / (field.full * unit), 0, 1))
         joined = chains(found.points, pairs, np.sqrt(field.peak / field.full), length, gap,
-                        GAP_STEEPNESS * footprint(planes.frame))
+                        GAP_STEEPNESS * footprint(planes.frame), RING)
         points = relaxed(joined, ROUNDS)
         out.append(Chains(points, joined.offset, joined.closed))
     return out

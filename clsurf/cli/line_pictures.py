@@ -15,7 +15,7 @@ LinesOption = Annotated[str, typer.Option("--lines", help="Draw feature lines: s
                                           "cubic surface than the one shown. A name in .svg gets the polylines.")]
 OnWhiteOption = Annotated[bool, typer.Option("--on-white", help="lines: draw them on white instead of over the "
                                              "shaded surface.")]
-LINE_ERROR = 0.02  # of the surface that lines are found on: a coarser one than what is shown gives the cleaner lines
+LINE_ERROR = 0.03  # of the surface that lines are found on: a coarser one than what is shown gives the cleaner lines
 CUBIC = 3
 
 
