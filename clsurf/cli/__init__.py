@@ -1,4 +1,4 @@
-"""The command line: `clsurf demo | devices | doctor | info | build | convert | render | report | smooth |
+"""The command line: `clsurf demo | devices | doctor | info | build | convert | render | trace | report | smooth |
 bench`.
 
 Bad input ends with one line and exit code 2, never with a traceback; long work shows a bar on a terminal and a plain
@@ -16,11 +16,12 @@ from .files import build, convert, info
 from .machine import bench, devices, doctor
 from .pictures import demo, render, report
 from .smooth import smooth
+from .trace import trace
 
 app = typer.Typer(name="clsurf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Compact surface models from scans, drawn on any OpenCL device.",
                   context_settings={"help_option_names": ["-h", "--help"]})
-for command in (demo, devices, doctor, info, build, convert, render, report, smooth, bench):
+for command in (demo, devices, doctor, info, build, convert, render, trace, report, smooth, bench):
     app.command()(command)
 
 
