@@ -52,6 +52,10 @@ def test_sample_fits(device):
     np.testing.assert_array_equal(found[..., 0], wanted[..., 0])
     np.testing.assert_allclose(found[..., 1:], wanted[..., 1:], rtol=2e-3, atol=2e-4)
     np.testing.assert_allclose(found[..., 5], wanted[..., 5], rtol=1e-3)
+    some = risk.fit_samples(tree, samples, radius, skips=[0, 1, 3])
+    for number, step in enumerate((1, 2, 4)):
+        np.testing.assert_array_equal(some[::step, number, :5], found[::step, number, :5])
+        assert step == 1 or not some[1::step, number].any()
 
 
 def test_radii_grow_with_the_noise_and_follow_the_shape(device):

@@ -346,7 +346,7 @@ def test_fit_quartics(device):
     radius = np.full(tree.padded // 16, 0.09, np.float32)
     surfels = quartics.fit_surfels(tree, radius)
     records = device.download(surfels.records)
-    centers = quartics.spread_centers(tree, quartics.SPACING * radius)
+    centers = quartics.spread_centers(tree, quartics.SPACING[0] * radius)
     assert device.download(surfels.balls)[3, :len(centers)].min() > 0
     assert (device.download(surfels.balls)[3, len(centers):] == -1).all()
     for i in range(0, len(centers), 7):

@@ -11,16 +11,17 @@ from ..device import Device
 from ..device.arrays import DeviceArray
 
 DEGREE = 4
-# Radius of the surfels over the best one of degree 2, and the distance between their centres over their radius.
-RADIUS_RATIO = 1.7
-SPACING = 0.35
+RADIUS_RATIO = 1.7  # of the surfels over the best one of degree 2
+# Distance between their centres over their radius, of exact points and of noisy ones. Closer centres average more (torus
+# with 0.1 % noise 0.0197 and 0.0187) for twice the fits, which are few where there is noise.
+SPACING = (0.35, 0.25)
+NOISY = 0.1  # point spacings of noise from which on points count as noisy, gradually
 GROWTH = 3.0  # times that a ball with too few points may grow
 TINY = 100  # points of a scan whose balls may grow to hold all of it
-# Added to the terms of degree 3 and 4 on the diagonal, over the sum of weights, where the noise is at least RIDGE_NOISE
-# point spacings: at rims, where the points hardly show these terms, the noise in them grows a hundredfold. Part of a
-# torus with 0.1 % noise: RMS 0.0251 to 0.0233, largest error 0.35 to 0.24; inside 0.0197 to 0.0198.
-RIDGE = np.array((0.004, 0.012))
-RIDGE_NOISE = 0.1
+# Added to the terms of degree 3 and 4 of noisy points on the diagonal, over the sum of weights: at rims, where the
+# points hardly show these terms, the noise in them grows a hundredfold. Part of a torus with 0.1 % noise: RMS 0.0251 to
+# 0.0233, largest error 0.35 to 0.25; inside no difference.
+RIDGE = (0.003, 0.008)
 CENTER = 3  # state of a chosen point (spread_centers.cl)
 SURFEL, LEAF = 32, 24  # floats a record of fit_quartics.cl, and of a SLIM surface's leaf (build/project.py)
 
@@ -56,14 +57,16 @@ def fit_surfels(tree: PointTree, block_radius: NDArray, noise: float = 0.0) -> S
         Its standard deviation over the point spacing.
     """
     device = tree.device
-    centers = device.upload(spread_centers(tree, SPACING * block_radius))
+    noisy = min(1.0, noise / NOISY) ** 2
+    spacing = SPACING[0] + noisy * (SPACING[1] - SPACING[0])
+    centers = device.upload(spread_centers(tree, spacing * block_radius))
     count = len(centers)
     padded = -(-count // BLOCK) * BLOCK
     growth = max(GROWTH, 2 / float(block_radius.min())) if tree.count < TINY else GROWTH
-    ridge = RIDGE * min(1.0, noise / RIDGE_NOISE) ** 2
     records, balls = device.empty((padded, SURFEL), np.float32), device.empty((4, padded), np.float32)
-    device.kernel("analysis/fit_quartics.cl")((padded,), (1,), count, padded, centers, device.upload(block_radius),
-                                              growth, *ridge, *tree.arguments, records, balls)
+    device.kernel("analysis/fit_quartics.cl")(
+        (padded,), (1,), count, padded, centers, device.upload(block_radius), growth, noisy * RIDGE[0],
+        noisy * RIDGE[1], *tree.arguments, records, balls)
     radius = device.upload(device.download(balls)[3])
     return SurfelTree(device, DEGREE, records, padded, balls, *build_boxes(balls, padded, device, radius=radius))
 

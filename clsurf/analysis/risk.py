@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from ..build.point_tree import BLOCK, PointTree
 
 SAMPLES = 1000
 RADII = 2.6 * 1.25 ** np.arange(11)  # over the point spacing, up to 24
+WIDE = (9.0, 17.0)  # radii from which half of the samples and a quarter will do: wide balls overlap
 NOISE_RADIUS = 4.0  # point spacings: the fit of degree 3 whose residual is the noise
 NEIGHBORS = 24  # samples whose differences of degree 2 and 4 are averaged
 # Variance of a fit over n points of a ball of radius rho under the weight (1 - d^2/rho^2)^3, in sigma^2 / (n rho^4) for
@@ -91,7 +93,8 @@ def local_spacings(tree: PointTree, blocks: NDArray) -> NDArray:
     return np.clip(spacing, typical / 8, typical * 8) if typical > 0 else np.full(len(blocks), 1e-6)
 
 
-def fit_samples(tree: PointTree, samples: Samples, radius: NDArray, residual: bool = False) -> NDArray:
+def fit_samples(tree: PointTree, samples: Samples, radius: NDArray, residual: bool = False, skips: NDArray | None = None
+                ) -> NDArray:
     """Return (s, r, 6) float64: points, mean curvature of degree 2 and 4, height of degree 2 and 4, squared residual.
 
     Parameters
@@ -100,12 +103,15 @@ def fit_samples(tree: PointTree, samples: Samples, radius: NDArray, residual: bo
         Of the balls.
     residual : bool
         Find the weighted mean square residual of degree 3 too (else 0).
+    skips : (r,) int, optional
+        Samples whose number has one of these bits are left out with that radius (0 points): 1 takes half, 3 a quarter.
     """
     device = tree.device
+    skips = np.zeros(radius.shape[1], np.int32) if skips is None else np.asarray(skips, np.int32)
     out = device.empty((*radius.shape, OUT), np.float32)
     device.kernel("analysis/sample_fits.cl", constants={"RESIDUAL": int(residual)})(
         (radius.size,), (1,), len(radius), radius.shape[1], device.upload(samples.index),
-        device.upload(np.ascontiguousarray(radius, np.float32)), *tree.arguments, out)
+        device.upload(np.ascontiguousarray(radius, np.float32)), device.upload(skips), *tree.arguments, out)
     return device.download(out).astype(np.float64)
 
 
@@ -126,7 +132,7 @@ def noise_level(tree: PointTree, samples: Samples) -> float:
 def two_degree_fits(tree: PointTree, samples: Samples, radii: NDArray = RADII) -> Fits:
     """Return the fits at all samples with `radii` (r,) over each one's spacing."""
     radius = samples.spacing[:, None] * radii
-    found = fit_samples(tree, samples, radius)
+    found = fit_samples(tree, samples, radius, skips=np.select([radii < r for r in WIDE], (0, 1), 3))
     return Fits(radius, found[..., 0], np.moveaxis(found[..., 1:3], -1, 0), np.moveaxis(found[..., 3:5], -1, 0))
 
 
@@ -138,39 +144,34 @@ def least_risk_radius(samples: Samples, fits: Fits, sigma: float, quantity: str 
     """
     low, high = VARIANCE[quantity]
     values = fits.curvature if quantity == "curvature" else fits.height
-    scale = sigma**2 / np.maximum(fits.count, 1)
-    if quantity == "curvature":
-        scale = scale / fits.radius**4
-    near, weight = sample_neighbors(samples)
+    taken = fits.count > 0
     difference = np.abs(values[0] - values[1])
     usable = (fits.count >= 20) & np.isfinite(difference)
-    difference = np.where(usable, difference, np.nan)
-    with np.errstate(invalid="ignore"):
-        # Of the mean absolute value, as if normally distributed: one crease must not decide for its neighbours (bunny
-        # with 0.2 % noise: median error of the mean curvature 5.9 by the mean square, 5.4 so).
-        mean2 = _mean(difference[near], weight[..., None]) ** 2 * (np.pi / 2)
+    mean = sample_means(samples)
+    around = mean @ usable
+    with np.errstate(divide="ignore", invalid="ignore"):
+        count = np.where(taken, fits.count, (mean @ (fits.count * usable)) / around)
+        scale = sigma**2 / count
+        if quantity == "curvature":
+            scale = scale / fits.radius**4
+        # Of the mean absolute value, as if normally distributed: one crease must not decide for its neighbours.
+        mean2 = (mean @ np.where(usable, difference, 0) / around) ** 2 * (np.pi / 2)
         risk = np.maximum(mean2 - (high - low) * scale, 0) + low * scale
-    risk[~usable] = np.inf
-    best = np.where(np.isfinite(risk).any(axis=1), np.argmin(np.where(np.isnan(risk), np.inf, risk), axis=1), 0)
+    risk[(taken & ~usable) | ~np.isfinite(risk)] = np.inf
+    best = np.argmin(risk, axis=1)
     log_radius = np.log(fits.radius[np.arange(len(best)), best])
-    return np.exp((log_radius[near] * weight).sum(axis=1) / weight.sum(axis=1))
+    return np.exp(mean @ log_radius)
 
 
-def sample_neighbors(samples: Samples) -> tuple[NDArray, NDArray]:
-    """Return the neighbours (s, k) of every sample on its own sheet, itself among them, and their weights (s, k)."""
-    count = min(NEIGHBORS, len(samples.index))
-    near = cKDTree(samples.position).query(samples.position, count)[1].reshape(len(samples.index), count)
-    same = np.einsum("ij,ikj->ik", samples.normals, samples.normals[near]) > 0.2
-    same[:, 0] = True
-    near[:, 0] = np.arange(len(near))  # copies of one point may have found each other
-    return near, same.astype(np.float64)
-
-
-def _mean(values, weight):
-    """Return the weighted mean over axis 1 of what is not NaN."""
-    known = ~np.isnan(values)
-    total = (weight * known).sum(axis=1)
-    return np.where(total > 0, (np.where(known, values, 0) * weight).sum(axis=1) / np.maximum(total, 1), np.nan)
+def sample_means(samples: Samples) -> sparse.csr_matrix:
+    """Return the matrix (s, s) that averages values of the samples over each one's neighbours on its own sheet."""
+    each, count = len(samples.index), min(NEIGHBORS, len(samples.index))
+    near = cKDTree(samples.position).query(samples.position, count)[1].reshape(each, count)
+    near[:, 0] = np.arange(each)  # copies of one point may have found each other
+    weight = (np.einsum("ij,ikj->ik", samples.normals, samples.normals[near]) > 0.2).astype(np.float64)
+    weight[:, 0] = 1
+    weight /= weight.sum(axis=1, keepdims=True)
+    return sparse.csr_matrix((weight.ravel(), near.ravel(), np.arange(0, weight.size + 1, count)), shape=(each, each))
 
 
 def block_radii(tree: PointTree, samples: Samples, radius: NDArray) -> NDArray:

@@ -32,8 +32,8 @@ __kernel void fit_quartics(int surfels, int padded_surfels, __global const int *
     int terms = sums.count >= NEED ? 15 : sums.count >= NEED_CUBIC ? 10 : 6;
     int known = sums.count >= NEED_QUADRATIC;
     for (int i = 6; i < terms; ++i) // a term of degree 3 or 4 that the points hardly show would be noise
-      sums.gram[i * (i + 1) / 2 + i] += (i < 10 ? ridge3 : ridge4) * sums.gram[0];
-    factorise(&sums, terms);
+      sums.row[i].s[i] += (i < 10 ? ridge3 : ridge4) * sums.row[0].s[0];
+    eliminate(&sums, terms);
     solve(&sums, terms, a);
     __global float *o = out + SURFEL * (size_t)s;
     float k[TERMS], parts[13] = {x, y, z, radius, f->nx, f->ny, f->nz, f->ux, f->uy, f->uz, f->vx, f->vy, f->vz};

@@ -7,8 +7,10 @@
 #endif
 #define OUT 6 // floats out: points, mean curvatures of degree 2 and 4, heights of degree 2 and 4, squared residual
 
-// `radius` holds `radii` of them for each sample. Curvatures and lengths are in the tree's units.
-__kernel void sample_fits(int samples, int radii, __global const int *center, __global const float *all_radii, int padded,
+// `all_radii` holds `radii` of them for each sample; radius number i is left out (0 points) at samples whose number has one of
+// the bits skips[i]. Curvatures and lengths are in the tree's units.
+__kernel void sample_fits(int samples, int radii, __global const int *center, __global const float *all_radii,
+                          __global const int *skips, int padded,
                           __global const float *sorted, __global const float *boxes, __global const int *node_offset,
                           int top_level, __global float *out) {
   int item = get_global_id(0);
@@ -16,13 +18,17 @@ __kernel void sample_fits(int samples, int radii, __global const int *center, __
   size_t n = padded;
   __global const float *own = sorted + center[item / radii];
   float x = own[0], y = own[n], z = own[2 * n], radius = all_radii[item];
+  __global float *o = out + OUT * (size_t)item;
+  if ((item / radii) & skips[item % radii]) {
+    for (int i = 0; i < OUT; ++i) o[i] = 0.0f;
+    return;
+  }
   Frame frame = frame_at(own[3 * n], own[4 * n], own[5 * n]), *f = &frame;
   Sums sums;
   float a[TERMS], c[TERMS];
   sum_ball(&sums, f, x, y, z, radius, padded, sorted, boxes, node_offset, top_level);
-  float weight = sums.gram[0];
-  factorise(&sums, TERMS);
-  __global float *o = out + OUT * (size_t)item;
+  float weight = sums.row[0].s[0];
+  eliminate(&sums, TERMS);
   o[0] = sums.count;
   for (int four = 0; four < 2; ++four) {
     solve(&sums, four ? 15 : 6, a);
