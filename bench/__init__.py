@@ -10,6 +10,7 @@ JOBS = {
     "build": "scan to SLIM surface: time, size, error, overlap, memory",
     "tiles": "frames: time, time per stage and tile, holes, silhouettes, depth and normals against ray casting",
     "lines": "feature lines: distance from analytic curves, frames with lines over them",
+    "trace": "rays a second: primary, shadows, ambient occlusion, arbitrary ones, beside Embree",
     "sparsity": "surfels and floats by degree for one error, linear splats beside quadratic surfels",
     "normals": "neighbours, normals and their orientation",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from reference import trace_rays as twin
 
 import clsurf
 from clsurf import Camera, Mesh, PatchDrawing, Scene
@@ -9,7 +10,6 @@ from clsurf.errors import Cancelled, InputError
 from clsurf.render.renderer import Renderer
 from clsurf.surface.placed import placed
 from clsurf.trace import hits as hits_module
-from tests.reference import trace_rays as twin
 
 
 def sphere_mesh(rings=24, segments=48, radius=1.0):

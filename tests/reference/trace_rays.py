@@ -3,7 +3,7 @@
 import numpy as np
 
 from clsurf.surface.slim import frame_of_normals
-from tests.reference.render import (
+from .render import (
     ALPHA,
     BACK_BIAS,
     K0,
