@@ -13,14 +13,14 @@ __kernel void line_slopes(int width, int height, int stride, __global const floa
   int lanes = x < 0 || y < 0 || y >= height ? 0 : width - x < VW ? width - x : VW;
   size_t at = (size_t)y * width + x;
   VF z = (VF)(NAN);
-  if (lanes > 0) z = load_channel(depth, at, 1, 0, lanes);
+  if (lanes > 0) z = load_channel(depth, at, lanes);
   STORE(depths + to, z);
   if (!any_lane(z == z)) return;  // the other planes are only read where there is a depth
   VF px = TO_VF(x + LANE_INDEX), g[3], n[3];
+  load_vectors(normal, at, lanes, n);
   for (int c = 0; c < 3; c++) {
     VF ray = camera[G0 + c] + px * camera[GX + c] + (float)y * camera[GY + c];
     g[c] = camera[IN_PERSPECTIVE] > 0.0f ? ray : (VF)(camera[FORWARD + c]);
-    n[c] = load_channel(normal, at, 3, c, lanes);
   }
   VF along = n[0] * g[0] + n[1] * g[1] + n[2] * g[2], g2 = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
   VF facing = SEL((VF)(-1e-4f), along, along < -1e-4f);

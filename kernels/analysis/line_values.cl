@@ -30,10 +30,10 @@ __kernel void line_values(int width, int height, int stride, int plane, float si
   VI hit = (LOAD_INT(links + to) & HIT) != 0;
   VF f = (VF)(0.0f), s = f;
   if (any_lane(hit)) {
-    f = finite_or_0(load_channel(field, at, 1, 0, lanes));
-    s = finite_or_0(load_channel(strength, at, 1, 0, lanes));
+    f = finite_or_0(load_channel(field, at, lanes));
+    s = finite_or_0(load_channel(strength, at, lanes));
 #if OTHER
-    VF o = finite_or_0(load_channel(other, at, 1, 0, lanes));
+    VF o = finite_or_0(load_channel(other, at, lanes));
     s = SEL(s, (VF)(0.0f), ABS(o) > ABS(s));
 #endif
     s = sign == 0.0f ? ABS(s) : sign * s;
@@ -43,9 +43,10 @@ __kernel void line_values(int width, int height, int stride, int plane, float si
   f *= factor; s *= factor;
 #endif
 #if AXIS
+  VF axes[3] = {(VF)(0.0f), (VF)(0.0f), (VF)(0.0f)};
+  if (any_lane(hit)) load_vectors(axis, at, lanes, axes);
   for (int c = 0; c < 3; c++) {
-    VF t = (VF)(0.0f);
-    if (any_lane(hit)) t = finite_or_0(load_channel(axis, at, 3, c, lanes));
+    VF t = finite_or_0(axes[c]);
     STORE(values + (size_t)c * plane + to, SEL((VF)(0.0f), f * t, hit));
     STORE(values + (size_t)(4 + c) * plane + to, t);
   }
