@@ -1,6 +1,8 @@
 """Feature lines against analytic curves, their drawing, their files, odd input."""
 
+import pickle
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -159,6 +161,35 @@ def test_empty_frames(device):
         assert len(found) == len(found.polylines) == 0 and found.lengths.shape == (0,)
         assert (found.draw().color == 1).all() and found.draw(frame).lines.max() == 0
         assert ElementTree.fromstring(found.svg()).tag.endswith("svg")
+
+
+def test_lines_are_plain_data(device):
+    """Read-only arrays; a copy drawn in another process is the same."""
+    found = clsurf.lines(exact(Torus(), TORUS_CAMERA, (96, 80)), ("contours", "parabolic"), device=device)
+    assert "contours" in repr(found) and not found.points.flags.writeable
+    again = pickle.loads(pickle.dumps(found))
+    assert again.device is None and np.array_equal(again.points, found.points) and again.kinds == found.kinds
+    assert sum(len(found.of(kind)) for kind in found.kinds) == len(found) == len(found.polylines)
+    with pytest.raises(ValueError, match="points: expected"):
+        replace(found, points=found.points[:-1])
+
+
+def test_contours_of_other_surfaces(device):
+    """They need depth and normal only: spatial patches have them too."""
+    frame = clsurf.render(clsurf.models.perfect_sphere(), size=(200, 150), channels=("depth", "normal"), device=device)
+    found = clsurf.lines(frame, "contours", device=device)
+    assert found.closed.tolist() == [True] and abs(found.lengths[0] / (np.pi * np.ptp(found.points[:, 0])) - 1) < 0.01
+
+
+def test_channels_with_values_that_are_not_finite(device):
+    """Such as the radial curvature where the eye looks along the normal."""
+    channels = implicit_channels(Torus(), TORUS_CAMERA, SIZE)
+    plain = clsurf.lines(Frame(channels, camera=TORUS_CAMERA), "suggestive_contours", detail=20, device=device)
+    spoilt = {name: value.copy() for name, value in channels.items()}
+    facing = np.abs(np.nan_to_num(spoilt["radial"])) > 2.4
+    spoilt["radial"][facing], spoilt["radial_derivative"][facing] = np.nan, np.inf
+    found = clsurf.lines(Frame(spoilt, camera=TORUS_CAMERA), "suggestive_contours", detail=20, device=device)
+    assert facing.sum() > 500 and len(found) == len(plain) and np.abs(found.points - plain.points).max() < 0.1
 
 
 def test_svg_holds_the_polylines(device, tmp_path):

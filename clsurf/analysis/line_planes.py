@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
+from ..errors import InputError
 from ..render.tiles import Scratch
 
 MARGIN_X, MARGIN_Y = 16, 8  # pixels around the planes; kernels/analysis/line_planes.clh
@@ -93,6 +94,9 @@ class LinePlanes:
         self.stride = self.columns + 2 * MARGIN_X
         self.rows = self.height + 2 * MARGIN_Y
         self.plane = self.stride * self.rows
+        if 2 * self.columns * self.height >= 2**31:
+            raise InputError(f"frame: expected less than 2^30 pixels to find lines in, got {frame.size}: render a "
+                             "smaller picture")
         device.check_memory(planes=4 * 14 * self.plane)
         self.camera = device.upload(camera_floats(frame.camera, frame.size))
         self._uploads: dict[str, DeviceArray] = {}

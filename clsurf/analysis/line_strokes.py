@@ -1,6 +1,6 @@
 """Feature lines as data, and their drawing: anti-aliased strokes over a picture, polylines as SVG."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from ..io.files import replacing
 from ..render.frame import Frame
 from ..render.renderer import checked_size
 from ..render.shade import to_linear
+from ..surface.arrays import frozen
 
 # sRGB, 0 to 1; ridges blue and valleys red as in the paper's figure 12.
 COLORS = {"contours": (0.0, 0.0, 0.0), "suggestive_contours": (0.0, 0.0, 0.0), "ridges": (0.05, 0.15, 0.60),
@@ -42,6 +43,8 @@ class Lines:
         Index into `kinds`.
     closed : (k,) bool
         Whether the last vertex is joined to the first.
+    device : Device, optional
+        What draws them.
     """
 
     size: tuple[int, int]
@@ -52,7 +55,17 @@ class Lines:
     offset: NDArray
     kind: NDArray
     closed: NDArray
-    device: object = field(default=None)
+    device: object = None
+
+    def __post_init__(self):
+        n, k = len(self.strength), len(self.kind)
+        for name, shape, dtype in (("points", (n, 2), np.float32), ("positions", (n, 3), np.float64),
+                                   ("strength", (n,), np.float32), ("offset", (k + 1,), np.int64),
+                                   ("kind", (k,), np.int32), ("closed", (k,), np.bool_)):
+            object.__setattr__(self, name, frozen(name, getattr(self, name), shape, dtype))
+
+    def __getstate__(self):
+        return self.__dict__ | {"device": None}  # a device belongs to its process
 
     def __len__(self):
         return len(self.kind)

@@ -23,7 +23,7 @@ FIELDS = {
     "crest": (Field("derivative1", "k1", axis="direction1", other="k2", least=1.7, peak=4.0, full=10.0),
               Field("derivative2", "k2", sign=-1, axis="direction2", extremum=-1, other="k1", least=1.7, peak=4.0,
                     full=10.0)),
-    "parabolic": (Field("gaussian", "mean", sign=0, least=0.25, peak=1.0, full=4.0),),
+    "parabolic": (Field("gaussian", "mean", sign=0, least=0.15, peak=0.5, full=2.0),),
 }
 KINDS = ("contours", *FIELDS)
 GAP_STEEPNESS = 6.0  # pixel footprints of depth per pixel that a gap may bridge
@@ -104,7 +104,7 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
     if "contours" in kinds:  # last: the other frame's planes take the place of this one's
         outline = planes if silhouette is None else LinePlanes(device, silhouette)
         parts.append((kinds.index("contours"), _contours(outline, min(length, CONTOUR_LENGTH), gap)))
-    return _joined(frame, kinds, parts, device)
+    return _joined(frame, kinds, sorted(parts, key=lambda part: part[0]), device)
 
 
 def _field_lines(planes: LinePlanes, kind, silhouette, smoothing, detail, length, gap) -> list[Chains]:
