@@ -11,7 +11,7 @@ from ..build.point_tree import build_point_tree, column_bounds
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
 from ..surface.cloud import PointCloud
-from .smooth_fits import Queries, Rings, Samples, blended, choose_radii, guided_fits, queries_of
+from .smooth_fits import LAST_STEP, Queries, Rings, Samples, blended, choose_radii, guided_fits, queries_of
 
 NEIGHBORS = 12  # of the spacing and of the means
 LEAST = 4  # points; fewer have no surface
@@ -94,7 +94,7 @@ def projected(points: NDArray, normals: NDArray, strength: float, device: Device
     queries = queries_of(sorted_points, turned, device)
     choice = choose_radii(samples, queries, rings, SHARP)
     radii = choice.factor * spacing * max(strength, 1.0)
-    off, *normal, _ = blended(guided_fits(samples, radii, SHARP), queries)
+    off, *normal, _ = blended(guided_fits(samples, radii, SHARP, LAST_STEP), queries)
     normal = np.stack(normal, axis=1)
     return _scattered(sorted_points - off[:, None] * normal, tree.order), _scattered(normal, tree.order)
 

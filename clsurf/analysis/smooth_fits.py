@@ -26,9 +26,9 @@ LEVERAGE = {1.0: ([1.0, 3.0, 7.3, 11.2, 16.8, 25.0, 37.5, 56.0, 83.0, 124.0],
                   [1.0, 0.8, 0.45, 0.329, 0.224, 0.152, 0.1023, 0.0678, 0.0431, 0.0278]),
             2.0: ([1.0, 4.0, 8.0, 14.2, 21.2, 31.5, 46.1, 69.1, 103.5, 152.9],
                   [1.0, 0.9, 0.55, 0.335, 0.2605, 0.1937, 0.1404, 0.0965, 0.0648, 0.0438])}
-SOFT = 0.03  # risks that differ by this much of the noise's variance count by 1 : 1/e in the mean radius
-RISK_ROUNDS, RADIUS_ROUNDS = 12, 4  # of means over neighbours: of squared residuals, of radii
-RADIUS_SHARE = 0.9  # of the radius of least risk of heights: normals ask for a little less bias
+SOFT = 0.01  # risks that differ by this much of the noise's variance count by 1 : 1/e in the mean radius
+RISK_ROUNDS, RADIUS_ROUNDS = 16, 5  # of means over neighbours: of squared residuals, of radii
+RADIUS_SHARE = 0.84  # of the radius of least risk of heights: normals ask for a little less bias
 OUTLIER = 5.0  # noise levels; larger residuals count as this
 FIT_SHARE = 1.31  # residuals have 1 - FIT_SHARE leverage of the noise's variance: the fit itself 0.69 of its leverage
 # Shapes with sharp edges: the excess of squared residuals at 4 spacings under weights that fall with the angle, over
@@ -36,7 +36,7 @@ FIT_SHARE = 1.31  # residuals have 1 - FIT_SHARE leverage of the noise's varianc
 EDGE_RADIUS, EDGE_BLIND, EDGE_SHARE = 3, 2.0, 0.4
 NOISE_SHARE = 0.9  # of the noise's variance that is surely noise: the estimate is 0 to 15 % high
 # Every STEP k^2-th independent point is a centre, k the radius over the spacing: 15 surfels overlap at each point.
-STEP = 0.25
+STEP, LAST_STEP = 0.25, 0.1  # while radii are chosen; for the result, 0.5 % less error
 
 
 @dataclass(eq=False)
@@ -142,24 +142,26 @@ def queries_of(points: NDArray, normals: NDArray, device: Device) -> Queries:
     return Queries(len(points), stride, device.upload(arrays))
 
 
-def centers_of(samples: Samples, radii: NDArray) -> NDArray:
-    """Return indices (m,) int32 of samples, as many as make about 15 balls of `radii` (n,) overlap at each."""
-    share = 1.0 / np.maximum(STEP * samples.points_per_vertex * (radii / samples.spacing) ** 2, 1.0)
+def centers_of(samples: Samples, radii: NDArray, step: float = STEP) -> NDArray:
+    """Return indices (m,) int32 of samples as centres of balls of `radii` (n,)."""
+    share = 1.0 / np.maximum(step * samples.points_per_vertex * (radii / samples.spacing) ** 2, 1.0)
     steps = np.floor(np.cumsum(share, dtype=np.float64))
     chosen = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0)
     return chosen.astype(np.int32)
 
 
-def guided_fits(samples: Samples, radii: NDArray, sharp: float) -> Fits:
+def guided_fits(samples: Samples, radii: NDArray, sharp: float, step: float = STEP) -> Fits:
     """Fit surfels of `radii` (n,), given at every sample, at a sparse choice of the samples.
 
     Parameters
     ----------
     sharp : float
         Weights fall with exp(-sharp (1 - cosine of the normals)).
+    step : float
+        Density of the centres, see `STEP`.
     """
     device = samples.device
-    center = centers_of(samples, radii)
+    center = centers_of(samples, radii, step)
     radius = np.ascontiguousarray(radii[center], np.float32)
     count, padded = len(center), -(-len(center) // BLOCK) * BLOCK
     records = device.empty((padded, SURFEL), np.float32)
