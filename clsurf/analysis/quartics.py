@@ -12,7 +12,7 @@ from ..device.arrays import DeviceArray
 
 DEGREE = 4
 RADIUS_RATIO = 1.7  # of the surfels over the best one of degree 2
-# Distance between their centres over their radius, of exact points and of noisy ones. Closer centres average more (torus
+# Distance between their centres over their radius, of exact points and of noisy ones. Closer ones average more (torus
 # with 0.1 % noise 0.0197 and 0.0187) for twice the fits, which are few where there is noise.
 SPACING = (0.35, 0.25)
 NOISY = 0.1  # point spacings of noise from which on points count as noisy, gradually

@@ -11,9 +11,10 @@
 #define NEED_QUADRATIC 6
 #define SURFEL 32 // floats out: centre, radius, normal, u, v, coefficients over the radius from 13, points
 
-__kernel void fit_quartics(int surfels, int padded_surfels, __global const int *center, __global const float *block_radius,
-                           float limit, float ridge3, float ridge4, int padded, __global const float *sorted, __global const float *boxes,
-                           __global const int *node_offset, int top_level, __global float *out, __global float *balls) {
+__kernel void fit_quartics(int surfels, int padded_surfels, __global const int *center,
+                           __global const float *block_radius, float limit, float ridge3, float ridge4, int padded,
+                           __global const float *sorted, __global const float *boxes, __global const int *node_offset,
+                           int top_level, __global float *out, __global float *balls) {
   int s = get_global_id(0);
   if (s >= padded_surfels) return;
   size_t n = padded;

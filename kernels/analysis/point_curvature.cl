@@ -67,7 +67,7 @@ INLINE void heights(__global const float *k, VF u, VF v, VF *h, VF *hu, VF *hv, 
 #endif
 }
 
-// Sums of G and of G times f, its gradient and its Hessian over the surfels around q that face `n`.
+// Sums of G and of G times f, its gradient and its Hessian over the surfels around q, as far as they face `n`.
 inline Blend blend_at(Vectors q, Vectors n, __global const float *surfels, size_t padded, __global const float *balls,
                       __global const float *boxes, __global const int *node_offset, int top_level) {
   float mx = 0.5f * (highest(q.x) - highest(-q.x)), my = 0.5f * (highest(q.y) - highest(-q.y)),
@@ -92,8 +92,8 @@ inline Blend blend_at(Vectors q, Vectors n, __global const float *surfels, size_
         float inverse = 1.0f / o[3], unit = RADIUS_UNITS ? inverse : 1.0f, back = RADIUS_UNITS ? o[3] : 1.0f;
         VF dx = q.x - o[0], dy = q.y - o[1], dz = q.z - o[2];
         VF g = 1.0f - (dx * dx + dy * dy + dz * dz) * (inverse * inverse);
-        g = SEL((VF)0.0f, g, (g > 0.0f) & (n.x * o[4] + n.y * o[5] + n.z * o[6] > 0.0f));
-        g = g * g * g;
+        VF cosine = n.x * o[4] + n.y * o[5] + n.z * o[6];
+        g = SEL((VF)0.0f, g * g * g * cosine * cosine, (g > 0.0f) & (cosine > 0.0f)); // gradually: no jumps at creases
         VF u = (o[7] * dx + o[8] * dy + o[9] * dz) * unit, v = (o[10] * dx + o[11] * dy + o[12] * dz) * unit;
         VF h, hu, hv, huu, huv, hvv;
         heights(o + 13, u, v, &h, &hu, &hv, &huu, &huv, &hvv);
@@ -153,6 +153,10 @@ __kernel void point_curvature(int count, int stride, __global const float *queri
     VF k = SEL((VF)0.0f, 1.0f / (length2 + 1e-30f), known), down = s.f * k, most = s.radius / (s.weight + 1e-30f);
     VF far2 = down * down * length2;
     down = SEL(down, down * most / VSQRT(far2 + 1e-30f), far2 > most * most);
+    VF turn = VSQRT(k);
+    n.x = SEL(n.x, s.gx * turn, known);
+    n.y = SEL(n.y, s.gy * turn, known);
+    n.z = SEL(n.z, s.gz * turn, known);
     q.x -= down * s.gx;
     q.y -= down * s.gy;
     q.z -= down * s.gz;

@@ -65,13 +65,13 @@ def fit_quartics(sorted_points, center, radius):
 
 
 def point_curvature(q, n, records, steps):
-    """Return the curvature at q (3,) of the surfels `records` (m, 32) that face n (3,), after Newton steps."""
+    """Return the curvature at q (3,) of the surfels `records` (m, 32), as far as they face n (3,), after `steps`."""
     for step in range(steps + 1):
         weight = f = 0
         gradient, hessian = np.zeros(3), np.zeros((3, 3))
         for o in records[np.linalg.norm(records[:, :3] - q, axis=1) < records[:, 3]]:
             d = (q - o[:3]) / o[3]
-            g = max(1 - d @ d, 0) ** 3 * (n @ o[4:7] > 0)
+            g = max(1 - d @ d, 0) ** 3 * max(n @ o[4:7], 0) ** 2
             u, v = d @ o[7:10], d @ o[10:13]
             dh = {(a, b): sum(c * _falling(i, a) * _falling(j, b) * u ** max(i - a, 0) * v ** max(j - b, 0)
                               for c, (i, j) in zip(o[13:28], POWERS, strict=True))
@@ -83,7 +83,7 @@ def point_curvature(q, n, records, steps):
             form = np.array([[dh[2, 0], dh[1, 1]], [dh[1, 1], dh[0, 2]]])
             hessian -= g / o[3] * (axes.T @ form @ axes)
         if step < steps:
-            q = q - f * gradient / (gradient @ gradient)
+            q, n = q - f * gradient / (gradient @ gradient), gradient / np.linalg.norm(gradient)
     length = np.linalg.norm(gradient)
     normal = gradient / length
     along = np.eye(3) - np.outer(normal, normal)
