@@ -75,6 +75,6 @@ def trace_lights(device: Device, lanes: int, traced: TracedSlim, view: DeviceArr
     tree = traced.tree
     constants = {**layout, **traced.constants, "VW": lanes, "TILE_BINS": TILE_BINS}
     device.kernel("trace/trace_lights.cl", constants=constants)(
-        *work_items(lanes, bins_x, bins_y), view, traced.boxes, traced.cones, tree.roots, tree.first_bottom,
+        *work_items(lanes, bins_x, bins_y), view, traced.boxes, tree.roots, tree.first_bottom,
         traced.surfels, traced.tails, lamps, lamp_count, reach, int(fresh), bins_x, bins_y, touched, planes, mask,
         stride, offset)

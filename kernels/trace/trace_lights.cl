@@ -5,6 +5,11 @@
 // they let open surfaces throw shadows. Points that face away from a lamp are not traced.
 // VW = 16: a work-item per TILE_BINS^2 bins, packets of 8x8 points; VW = 1: one point each.
 // Twin: tests/reference/trace.py, trace_lights.
+#ifndef PACKET_X
+#define PACKET_X 2  // bins of a packet, across and down; 1 x 1: 76, 2 x 1: 85, 2 x 2: 93, 4 x 2: 90, 4 x 4: 82 Mrays/s of
+#define PACKET_Y 2  // ambient occlusion
+#endif
+#define PACKET_BINS (PACKET_X * PACKET_Y)
 #include "trace/packet.clh"
 #include "common/bins.clh"
 #include "common/planes.clh"
@@ -24,7 +29,7 @@ enum { HEADLIGHT, DIRECTIONAL, POINT };
 #define GRAZING_RADII 0.04f  // error of a surfel's height: at the angle whose cosine is c it shifts a hit by this over c
 #endif
 #ifndef FRONT_RADII
-#define FRONT_RADII 1.0f  // 0: hits from the front do not count
+#define FRONT_RADII 1.0f
 #endif
 #define LARGEST_OFFSET 2.0f
 #ifndef RIM_COSINE
@@ -39,14 +44,17 @@ typedef struct {
 } Target;
 
 // Set `lost` where something lies on the way to the targets `want`, not more than `reach` before them.
-INLINE void occlude(__global const float *boxes, __global const float *cones, int roots, int first_bottom,
-                    __global const float *surfels, __global const float *tails, Packet *packet, const Target *target,
-                    float reach, const VI *want, VI *lost) {
+INLINE void occlude(__global const float *boxes, int roots, int first_bottom, __global const float *surfels,
+                    __global const float *tails, Packet *packet, const Target *target, float reach, const VI *want,
+                    VI *lost) {
   Sieve sieve;
   Waiting waiting;
   BlockBounds bounds;
   float near = INFINITY, block_far[BLOCKS];
   for (int b = 0; b < BLOCKS; b++) {
+    block_far[b] = -INFINITY;
+    bounds.least_x[b] = bounds.least_y[b] = 1e30f; bounds.largest_x[b] = bounds.largest_y[b] = -1e30f;
+    if (!any_lane(want[b])) continue;
     bound_block(target[b].x, target[b].y, want[b], b, &bounds);
     block_far[b] = largest_lane(SEL((VF)(-INFINITY), target[b].t, want[b]));
     near = VMIN(near, least_lane(SEL((VF)(INFINITY), target[b].t, want[b])));
@@ -59,16 +67,25 @@ INLINE void occlude(__global const float *boxes, __global const float *cones, in
   while (waiting.count > 0) {
     float far = -INFINITY;
     for (int b = 0; b < BLOCKS; b++) far = VMAX(far, block_far[b]);
-    int node = next_bottom(boxes, roots, first_bottom, &sieve, near, far, &waiting);
+    uint slots = 0;
+    int node = next_bottom(boxes, roots, first_bottom, &sieve, near, far, &waiting, &slots);
     if (node < 0) continue;
     int slot = first_slot(node, first_bottom);
     for (int part = 0; part < WIDE; part += VW) {
+      if (VW == 1 && !(slots >> part & 1u)) continue;
       Projected projected;
       Piece piece;
       project_surfels(surfels + (size_t)slot * SURFEL_FLOATS, part, packet, &projected, &piece);
-      uint enters = FRONT_RADII > 0 ? mask_of(piece.enters) : 0u, leaves = mask_of(piece.leaves);
+      // What reaches no further from the lamp than the offsets, the points' own surfels above all, cannot hide them.
+      VF r = projected.field[OWN_RADIUS];
+      VI within = (piece.least_x <= packet->largest_x) & (piece.largest_x >= packet->least_x)
+                & (piece.least_y <= packet->largest_y) & (piece.largest_y >= packet->least_y);
+      uint enters = mask_of(within & piece.enters & (piece.near < far - (FRONT_RADII + OFFSET_RADII) * r));
+      uint leaves = mask_of(within & piece.leaves & (piece.near < far - OFFSET_RADII * r));
+      if (!(enters | leaves)) continue;
       for (int b = 0; b < BLOCKS; b++) {
-        uint bits = pieces_in_block(&piece, &bounds, b, near, block_far[b]) & (enters | leaves);
+        if (block_far[b] == -INFINITY) continue;
+        uint bits = pieces_in_block(&piece, &bounds, b, near, block_far[b]) & slots >> part & (enters | leaves);
         if (!bits) continue;
         VF px = target[b].x, py = target[b].y, end = target[b].t, offset = target[b].offset;
         VI hit = lost[b];
@@ -77,16 +94,17 @@ INLINE void occlude(__global const float *boxes, __global const float *cones, in
           bits &= bits - 1;
           const float *own = (const float *)projected.field + j;
           __global const float *k = tails + (size_t)(slot + part + j) * TAIL_FLOATS - K0;
-          VF u, v, w, du, dv, dw, t, r = OWN(OWN_RADIUS);
+          VF u, v, w, du, dv, dw, t;
+          float radius = OWN(OWN_RADIUS);
           place_ray(own, px, py, &u, &v, &w, &du, &dv, &dw);
           RayPoly p = ray_poly(k, u, v, w, du, dv, dw);
           if (leaves >> j & 1u) {
             VI good = piece_root(k, own, p, -1.0f, u, v, w, du, dv, dw, &t);
-            hit = hit | (good & (t < end - offset * r) & (t > end - reach) & (t > near));
+            hit = hit | (good & (t < end - offset * radius) & (t > end - reach) & (t > near));
           }
           if (enters >> j & 1u) {
             VI good = piece_root(k, own, p, 1.0f, u, v, w, du, dv, dw, &t);
-            hit = hit | (good & (t < end - (FRONT_RADII + offset) * r) & (t > end - reach) & (t > near));
+            hit = hit | (good & (t < end - (FRONT_RADII + offset) * radius) & (t > end - reach) & (t > near));
           }
         }
         lost[b] = hit;
@@ -175,42 +193,52 @@ INLINE void aim_point(__global const float *view, float lx, float ly, float lz, 
   }
 }
 
-INLINE void shadow_bin(__global const float *view, __global const float *boxes, __global const float *cones, int roots,
-                       int first_bottom, __global const float *surfels, __global const float *tails,
-                       __global const float *lamps, int lamp_count, float reach, int fresh, int bin_x, int bin_y,
-                       int pixel, __global const float *planes, __global uint *mask) {
+// The packets of PACKET_X x PACKET_Y bins from (bin_x, bin_y) on (VW = 1: one pixel of a bin).
+INLINE void shadow_bins(__global const float *view, __global const float *boxes, int roots, int first_bottom,
+                        __global const float *surfels, __global const float *tails, __global const float *lamps,
+                        int lamp_count, float reach, int fresh, int bin_x, int bin_y, int pixel, int bins_x, int bins_y,
+                        __global const int *touched, __global const float *all_planes, __global uint *mask,
+                        int mask_stride) {
   Target target[BLOCKS];
   VF nx[BLOCKS], ny[BLOCKS], nz[BLOCKS];
   VF rim[BLOCKS];
   VI seen[BLOCKS], found[BLOCKS];
-  int at[BLOCKS], any = 0;
+  int at[BLOCKS], bins[BLOCKS], any = 0;
   float inv_fx = 1.0f / view[FX], inv_fy = 1.0f / view[FY];
   for (int b = 0; b < BLOCKS; b++) {
+    int own_x = bin_x + b / BIN_BLOCKS % PACKET_X, own_y = bin_y + b / BIN_BLOCKS / PACKET_X;
+    int inside = own_x < bins_x && own_y < bins_y;
+    bins[b] = inside ? own_y * bins_x + own_x : 0;
+    if (inside && touched[bins[b]] < 0) inside = 0;
+    if (!inside) bins[b] = -1;
+    seen[b] = 0; found[b] = 0;
+    if (!inside) continue;
+    __global const float *planes = all_planes + (size_t)bins[b] * BIN_PIXELS * FIELDS;
 #if VW == 1
     int x = pixel & 7, y = pixel >> 3;
     at[b] = pixel;
 #else
-    VI x = (LANE_INDEX & 3) + (b & 1) * 4, y = (LANE_INDEX >> 2) + (b >> 1) * 4;
-    at[b] = (b >> 1) * 4 * BIN + (b & 1) * 4;
+    VI x = (LANE_INDEX & 3) + (b & 1) * 4, y = (LANE_INDEX >> 2) + (b >> 1 & 1) * 4;
+    at[b] = (b >> 1 & 1) * 4 * BIN + (b & 1) * 4;
 #endif
     VF depth = load_plane(planes, FIELD_DEPTH, at[b]);
     seen[b] = depth < EMPTY_DEPTH;
     VF t = SEL((VF)(1.0f), depth, seen[b]), across = view[PERSPECTIVE] > 0.0f ? t : (VF)(1.0f);
-    target[b].X = (TO_VF(x) + (bin_x * BIN + 0.5f) - view[CX]) * inv_fx * across;
-    target[b].Y = (view[CY] - (TO_VF(y) + (bin_y * BIN + 0.5f))) * inv_fy * across;
+    target[b].X = (TO_VF(x) + (own_x * BIN + 0.5f) - view[CX]) * inv_fx * across;
+    target[b].Y = (view[CY] - (TO_VF(y) + (own_y * BIN + 0.5f))) * inv_fy * across;
     target[b].Z = -t;
     nx[b] = load_plane(planes, FIELD_NORMAL, at[b]);
     ny[b] = load_plane(planes, FIELD_NORMAL + 1, at[b]);
     nz[b] = load_plane(planes, FIELD_NORMAL + 2, at[b]);
+    VF inv = 1.0f / VSQRT(nx[b] * nx[b] + ny[b] * ny[b] + nz[b] * nz[b] + 1e-30f);
+    nx[b] *= inv; ny[b] *= inv; nz[b] *= inv;
     VF facing = nz[b], sight = 1.0f;
     if (view[PERSPECTIVE] > 0.0f) {
       facing = -(nx[b] * target[b].X + ny[b] * target[b].Y + nz[b] * target[b].Z);
       sight = target[b].X * target[b].X + target[b].Y * target[b].Y + target[b].Z * target[b].Z;
     }
-    sight *= RIM_COSINE * RIM_COSINE * (nx[b] * nx[b] + ny[b] * ny[b] + nz[b] * nz[b]);
-    rim[b] = SEL((VF)(OFFSET_RADII), (VF)(RIM_OFFSET), facing * facing < sight);
-    found[b] = 0;
-    if (!fresh) found[b] = AS_VI(load_plane((__global const float *)mask, 0, at[b]));
+    rim[b] = SEL((VF)(OFFSET_RADII), (VF)(RIM_OFFSET), facing * facing < RIM_COSINE * RIM_COSINE * sight);
+    if (!fresh) found[b] = AS_VI(load_plane((__global const float *)(mask + (size_t)bins[b] * mask_stride), 0, at[b]));
     any |= any_lane(seen[b]);
   }
   for (int l = 0; l < lamp_count && any; l++) {
@@ -221,15 +249,17 @@ INLINE void shadow_bin(__global const float *view, __global const float *boxes, 
     VI want[BLOCKS], later[BLOCKS], lost[BLOCKS];
     int left = 0;
     for (int b = 0; b < BLOCKS; b++) {
+      want[b] = 0; later[b] = 0; lost[b] = 0;
+      if (bins[b] < 0) continue;
       VF tx = lx, ty = ly, tz = lz;
       if (kind == POINT) { tx -= target[b].X; ty -= target[b].Y; tz -= target[b].Z; }
       VF toward = nx[b] * tx + ny[b] * ty + nz[b] * tz;
-      VF slant = VSQRT((tx * tx + ty * ty + tz * tz) * (nx[b] * nx[b] + ny[b] * ny[b] + nz[b] * nz[b]) + 1e-30f);
-      slant = GRAZING_RADII * slant / VMAX(toward, GRAZING_RADII / LARGEST_OFFSET * slant);
+      VF length = 1.0f;
+      if (kind == POINT) length = VSQRT(tx * tx + ty * ty + tz * tz);
+      VF slant = GRAZING_RADII * length / VMAX(toward, GRAZING_RADII / LARGEST_OFFSET * length);
       target[b].offset = VMAX(slant, rim[b]);
       VI before = (found[b] >> l & 1) != 0;
       want[b] = seen[b] & (toward > 0.0f) & NOT(before);
-      later[b] = 0; lost[b] = 0;
       left |= any_lane(want[b]);
     }
     for (int packets = 0; packets < 8; packets++) {
@@ -237,7 +267,7 @@ INLINE void shadow_bin(__global const float *view, __global const float *boxes, 
       Packet packet;
       if (kind == POINT) aim_point(view, lx, ly, lz, target, want, later, &packet);
       else aim_directional(view, lx, ly, lz, target, &packet);
-      occlude(boxes, cones, roots, first_bottom, surfels, tails, &packet, target, reach, want, lost);
+      occlude(boxes, roots, first_bottom, surfels, tails, &packet, target, reach, want, lost);
       left = 0;
       for (int b = 0; b < BLOCKS; b++) {
         found[b] = found[b] | (SEL((VI)(0), (VI)(1), want[b] & lost[b]) << l);
@@ -247,31 +277,26 @@ INLINE void shadow_bin(__global const float *view, __global const float *boxes, 
       }
     }
   }
-  for (int b = 0; b < BLOCKS; b++) store_plane((__global float *)mask, 0, at[b], AS_VF(found[b]));
+  for (int b = 0; b < BLOCKS; b++)
+    if (bins[b] >= 0) store_plane((__global float *)(mask + (size_t)bins[b] * mask_stride), 0, at[b], AS_VF(found[b]));
 }
 
 // `mask` has a plane of 64 words every `mask_stride` words, one for each bin; `fresh`: it holds nothing yet.
-__kernel void trace_lights(__global const float *view, __global const float *boxes, __global const float *cones,
-                           int roots, int first_bottom, __global const float *surfels, __global const float *tails,
-                           __global const float *lamps, int lamp_count, float reach, int fresh, int bins_x, int bins_y,
-                           __global const int *touched, __global const float *all_planes, __global uint *mask,
-                           int mask_stride, int mask_offset) {
+__kernel void trace_lights(__global const float *view, __global const float *boxes, int roots, int first_bottom,
+                           __global const float *surfels, __global const float *tails, __global const float *lamps,
+                           int lamp_count, float reach, int fresh, int bins_x, int bins_y, __global const int *touched,
+                           __global const float *all_planes, __global uint *mask, int mask_stride, int mask_offset) {
 #if VW == 1
   int bin = get_group_id(0), pixel = get_local_id(0);
   if (bin >= bins_x * bins_y || touched[bin] < 0) return;
-  shadow_bin(view, boxes, cones, roots, first_bottom, surfels, tails, lamps, lamp_count, reach, fresh, bin % bins_x,
-             bin / bins_x, pixel, all_planes + (size_t)bin * BIN_PIXELS * FIELDS,
-             mask + (size_t)bin * mask_stride + mask_offset);
+  shadow_bins(view, boxes, roots, first_bottom, surfels, tails, lamps, lamp_count, reach, fresh, bin % bins_x,
+              bin / bins_x, pixel, bins_x, bins_y, touched, all_planes, mask + mask_offset, mask_stride);
 #else
   int tiles_x = (bins_x + TILE_BINS - 1) / TILE_BINS, tile = get_global_id(0);
   int x0 = tile % tiles_x * TILE_BINS, y0 = tile / tiles_x * TILE_BINS;
-  for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
-    int bin_x = x0 + i % TILE_BINS, bin_y = y0 + i / TILE_BINS;
-    if (bin_x >= bins_x || bin_y >= bins_y) continue;
-    int bin = bin_y * bins_x + bin_x;
-    if (touched[bin] < 0) continue;
-    shadow_bin(view, boxes, cones, roots, first_bottom, surfels, tails, lamps, lamp_count, reach, fresh, bin_x, bin_y, 0,
-               all_planes + (size_t)bin * BIN_PIXELS * FIELDS, mask + (size_t)bin * mask_stride + mask_offset);
-  }
+  for (int y = y0; y < y0 + TILE_BINS && y < bins_y; y += PACKET_Y)
+    for (int x = x0; x < x0 + TILE_BINS && x < bins_x; x += PACKET_X)
+      shadow_bins(view, boxes, roots, first_bottom, surfels, tails, lamps, lamp_count, reach, fresh, x, y, 0, bins_x,
+                  bins_y, touched, all_planes, mask + mask_offset, mask_stride);
 #endif
 }

@@ -35,16 +35,18 @@ INLINE void frontmost(__global const float *boxes, int roots, int first_bottom, 
   while (waiting.count > 0) {
     far = -INFINITY;
     for (int b = 0; b < BLOCKS; b++) far = VMAX(far, block_far[b]);
-    int node = next_bottom(boxes, roots, first_bottom, &sieve, near, far, &waiting);
+    uint slots = 0;
+    int node = next_bottom(boxes, roots, first_bottom, &sieve, near, far, &waiting, &slots);
     if (node < 0) continue;
     int slot = first_slot(node, first_bottom);
     for (int part = 0; part < WIDE; part += VW) {
+      if (VW == 1 && !(slots >> part & 1u)) continue;
       Projected projected;
       Piece piece;
       project_surfels(surfels + (size_t)slot * SURFEL_FLOATS, part, packet, &projected, &piece);
       uint enters = mask_of(piece.enters), leaves = mask_of(piece.leaves);
       for (int b = 0; b < BLOCKS; b++) {
-        uint bits = pieces_in_block(&piece, bounds, b, near, block_far[b]);
+        uint bits = pieces_in_block(&piece, bounds, b, near, block_far[b]) & slots >> part;
         if (!bits) continue;
         Ray own_ray = ray[b];
         while (bits) {
@@ -119,11 +121,13 @@ INLINE void blend(__global const float *balls, int roots, int first_bottom, __gl
   near -= slack; far += slack;
   start_walk(&waiting);
   while (waiting.count > 0) {
-    int node = next_bottom(balls, roots, first_bottom, &sieve, near, far, &waiting);
+    uint slots = 0;
+    int node = next_bottom(balls, roots, first_bottom, &sieve, near, far, &waiting, &slots);
     if (node < 0) continue;
     int slot = first_slot(node, first_bottom);
     __global const float *own_surfels = surfels + (size_t)slot * SURFEL_FLOATS;
     for (int part = 0; part < WIDE; part += VW) {
+      if (VW == 1 && !(slots >> part & 1u)) continue;
       uint held[BLOCKS], any = 0;
       for (int b = 0; b < BLOCKS; b++) any |= held[b] = balls_in_box(own_surfels, part, packet, box[b]);
       if (!any) continue;
