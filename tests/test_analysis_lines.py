@@ -135,6 +135,12 @@ def test_lines_of_a_rendered_surface(device):
         away = pixel_distance(torus, TORUS_CAMERA, SIZE, part.points.astype(float), lambda c, name=channel: c[name])
         assert part.lengths.sum() > 60 and np.nanmean(away) < 0.3
     assert found.of("contours").lengths.sum() > 500
+    for options in ({"tile": 64}, {"lanes": 1}):
+        with clsurf.Renderer(device, **options) as renderer:
+            other = renderer.render(surface, TORUS_CAMERA, SIZE, clsurf.line_channels(ALL))
+        again = clsurf.lines(other, ("contours", "suggestive_contours", "parabolic"), detail=5, device=device)
+        assert len(again) == len(found) and abs(again.lengths - found.lengths).max() < 1
+        assert np.median(np.linalg.norm(again.points - found.points, axis=1)) < 1e-3
     drawn = found.draw(frame)
     assert drawn.color.shape == (256, 256, 4) and np.array_equal(drawn.depth, frame.depth, equal_nan=True)
     assert (drawn.color[drawn.lines == 0] == frame.color[drawn.lines == 0]).all() and 0 < drawn.lines.max() <= 1
@@ -250,7 +256,7 @@ def test_chains_are_walked_in_order():
     assert np.abs(straight[:, 1]).max() < 1e-6
 
 
-@pytest.mark.parametrize("kinds", ("lines", (), ("ridges", "creases")))
+@pytest.mark.parametrize("kinds", ("lines", (), ("ridges", "creases"), 3, None, [["ridges"]]))
 def test_unknown_kinds(device, kinds):
     with pytest.raises(InputError, match="kinds: expected some of contours"):
         clsurf.lines(exact(Torus(), TORUS_CAMERA, (16, 16)), kinds, device=device)

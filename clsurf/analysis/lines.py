@@ -35,12 +35,22 @@ HIDDEN_FOOTPRINTS = 16.0  # a line so far behind the silhouette's surface is hid
 
 
 def line_channels(kinds) -> tuple[str, ...]:
-    """Return the channels that `lines` needs of a frame for the given kind or kinds of lines.
+    """Return the channels that `lines` needs of a frame, for `render(..., channels=...)`.
 
-    Examples
-    --------
-    >>> line_channels("contours")
-    ('depth', 'normal')
+    Parameters
+    ----------
+    kinds : str or sequence of str
+        Kinds of lines; see `lines`.
+
+    Returns
+    -------
+    tuple of str
+        Such as ("depth", "normal") for "contours".
+
+    Raises
+    ------
+    InputError
+        An unknown kind.
     """
     names = [name for kind in checked_kinds(kinds) for field in FIELDS.get(kind, ()) for name in field.channels]
     return tuple(dict.fromkeys(("depth", "normal", *names)))
@@ -182,10 +192,12 @@ def median_curvature(frame: Frame) -> float:
 
 def checked_kinds(kinds) -> tuple[str, ...]:
     """Return the kinds of lines as a tuple, or raise InputError."""
-    kinds = (kinds,) if isinstance(kinds, str) else tuple(dict.fromkeys(kinds))
+    if not isinstance(kinds, str | list | tuple):
+        raise InputError(f"kinds: expected some of {', '.join(KINDS)}, got {kinds!r}")
+    kinds = (kinds,) if isinstance(kinds, str) else tuple(dict.fromkeys(map(str, kinds)))
     unknown = [kind for kind in kinds if kind not in KINDS]
     if unknown or not kinds:
-        raise InputError(f"kinds: expected some of {', '.join(KINDS)}, got {', '.join(map(str, kinds)) or 'none'}")
+        raise InputError(f"kinds: expected some of {', '.join(KINDS)}, got {', '.join(kinds) or 'none'}")
     return kinds
 
 
