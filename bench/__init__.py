@@ -13,6 +13,7 @@ JOBS = {
     "trace": "rays a second: primary, shadows, ambient occlusion, arbitrary ones, beside Embree",
     "sparsity": "surfels and floats by degree for one error, linear splats beside quadratic surfels",
     "normals": "neighbours, normals and their orientation",
+    "curvature": "curvature at points: error and time on tori, MeshLab's filters",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
