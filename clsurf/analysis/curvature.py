@@ -29,7 +29,7 @@ from . import risk
 from .quartics import RADIUS_RATIO, SurfelTree, evaluate, fit_surfels
 from .scan_points import scan_points
 
-NOISY = 0.05  # of the point spacing: noise above which normals are averaged
+NOISY = (0.05, 0.3)  # point spacings of noise above which normals are averaged, and averaged again
 NORMAL_REACH = 4.0  # point spacings that they are averaged over
 FAR = 1e6  # coordinate beyond which a query is as good as infinitely far, in the tree's units
 # Newton steps onto the blend: a scan's own points lie within the noise of it, other points come from a tangent plane.
@@ -231,8 +231,9 @@ def _plan(tree: PointTree, radius: float | None, report) -> _Plan:
     samples = risk.spread_samples(tree)
     spacing = float(np.median(samples.spacing))
     sigma = risk.noise_level(tree, samples)
-    if sigma > NOISY * spacing:
-        tree = risk.with_mean_normals(tree, NORMAL_REACH * spacing)
+    for least in NOISY:
+        if sigma > least * spacing:
+            tree = risk.with_mean_normals(tree, NORMAL_REACH * spacing)
     report("noise", 0.3)
     if radius is not None:
         return _Plan(tree, np.full(tree.padded // BLOCK, radius, np.float32), sigma / spacing)
