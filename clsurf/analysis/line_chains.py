@@ -84,25 +84,21 @@ def chains(points: NDArray, segments: NDArray, peak: float, length: float, gap: 
     count, label = connected_components(graph, directed=True, connection="weak")
     share = _lengths(points, segments) * points[segments, 3].mean(axis=1)
     total = np.bincount(label[segments[:, 0]], share, count)
-    highest = np.full(count, -np.inf)
-    np.maximum.at(highest, label, points[:, 3])
-    open_line = np.zeros(count, bool)
+    strong, open_line = np.zeros(count, bool), np.zeros(count, bool)
+    strong[label[points[:, 3] >= peak]] = True
     open_line[label[np.diff(graph.indptr) == 1]] = True
-    keep = (total >= length * np.where(open_line, 1.0, ring)) & (highest >= peak)
+    keep = (total >= length * np.where(open_line, 1.0, ring)) & strong
     used = segments[keep[label[segments[:, 0]]]]
     if len(used) == 0:
         return Chains(np.empty((0, 4), np.float32), np.zeros(1, np.int64), np.empty(0, bool))
     degree = np.bincount(used.ravel(), minlength=n)
     own = np.flatnonzero(degree)
-    # Every line starts at its first end, or a closed one at its first point.
-    start = np.full(count, n)
-    np.minimum.at(start, label[own], own)
-    ends = np.flatnonzero(degree == 1)
-    first_end = np.full(count, n)
-    np.minimum.at(first_end, label[ends], ends)
-    lines = np.unique(label[own])
-    closed = first_end[lines] == n
-    starts = np.where(closed, start[lines], first_end[lines])
+    # Every line starts at its first end, or a closed one at its first point: what is assigned last stays.
+    ends, start = np.flatnonzero(degree == 1), np.full(count, -1)
+    start[label[own[::-1]]] = own[::-1]
+    start[label[ends[::-1]]] = ends[::-1]
+    lines = np.flatnonzero(start >= 0)
+    closed, starts = ~open_line[lines], start[lines]
     return Chains(*_ordered(points, used, starts), closed)
 
 
