@@ -220,8 +220,6 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
     int px = x * BIN + item % BIN, py = y * BIN + item / BIN;
     Shown s = resolve(view, patches, nodes, payload_of(&to, SLOT_OF(px - to.x, py - to.y)), px + 0.5f, py + 0.5f);
     store_block(planes, was_touched, item, &s, surface);
-    barrier(CLK_GLOBAL_MEM_FENCE);
-    if (item == 0) touched[bin] = (was_touched ? touched[bin] : 0) + cost[b];
 #else
     for (int q = 0; q < 64 / VW; q++) {
       int qx = q / (16 / VW) % 2 * 4, qy = q / (32 / VW) * 4 + q % (16 / VW) * (VW / 4);
@@ -233,5 +231,13 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
     touched[bin] = (was_touched ? touched[bin] : 0) + cost[b];
 #endif
   }
+#if VW == 1
+  // All have read it by then; a barrier in the loop above, which some tiles leave early, made PoCL crash.
+  barrier(CLK_GLOBAL_MEM_FENCE);
+  for (int b = item; b < TILE_BINS * TILE_BINS; b += GROUP) {
+    int x = bin_x + b % TILE_BINS, y = bin_y + b / TILE_BINS, bin = y * bins_x + x;
+    if (x < bins_x && y < bins_y) touched[bin] = (touched[bin] >= 0 ? touched[bin] : 0) + cost[b];
+  }
+#endif
 #endif
 }
