@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 from reference import differentials as twin
 from reference import render
-from reference.surfaces import fitted, leaves, sphere, torus_points
+from reference.render_patch_modes import average
+from reference.surfaces import fitted, leaves, sphere, sphere_points, torus_points
 from test_render_project import cameras, staged
 
 from clsurf.errors import InputError
+from clsurf.io import images
 from clsurf.render.camera import Camera
 from clsurf.render.differentials import DIFFERENTIALS
 from clsurf.render.renderer import Renderer
 from clsurf.render.slim_drawing import SlimDrawing
+from clsurf.surface.patch import PatchSurface
 
 SMALL = (44, 35)  # for the twins, which ask every surfel at every pixel
 SIZE = (90, 70)
@@ -217,6 +220,168 @@ def test_kernel_forms_and_tiles_agree(device, torus, which):
         for name in names_of(torus.degree):
             one, two = frames[0].channels[name], frame.channels[name]
             assert np.isclose(one, two, rtol=1e-3, atol=2e-3, equal_nan=True).mean() > 0.995, name
+
+
+@pytest.mark.parametrize("factor", (1e-6, 1.0, 1e5))
+def test_placed_surfaces_have_world_curvature(device, torus, factor):
+    """Turned, moved and scaled: curvature goes with 1 / scale, its derivatives with the square, directions turn."""
+    turn = Camera.look_at((1, 2, 3), (0, 0, 0)).rotation
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = factor * turn, factor * np.array([3.0, -2.0, 1.0])
+    camera, names = cameras()[0], names_of(torus.degree)
+    middle = matrix[:3, :3] @ camera.eye + matrix[:3, 3]
+    other = Camera(eye=middle, rotation=camera.rotation @ turn.T, fov=camera.fov)
+    with Renderer(device) as r:
+        one = r.render(torus, camera, SIZE, ("depth", *names))
+        two = r.render(torus.moved(matrix), other, SIZE, ("depth", *names))
+    both = np.isfinite(one.depth) & np.isfinite(two.depth)
+    assert (np.isfinite(one.depth) == np.isfinite(two.depth)).mean() > 0.998
+    for name in names:
+        power = 2 if name == "gaussian" or DIFFERENTIALS[name][1] == 3 else 1
+        a, b = one.channels[name][both], two.channels[name][both]
+        if name.startswith("direction"):
+            close = np.abs((a @ turn.T * b).sum(axis=1)) > 1 - 1e-3
+        else:
+            b = b * factor**power
+            if name.startswith("derivative"):
+                a, b = np.abs(a), np.abs(b)
+            close = np.isclose(a, b, rtol=0.01, atol=0.01 * np.median(np.abs(a)))
+        assert close.mean() > 0.98, (name, close.mean())
+
+
+def test_sides(device):
+    """The sign follows the stored normals; from inside too; without orientation it is that of the side that is seen."""
+    ball = sphere(400, 2.0, reach=1.3)
+    turned = leaves(ball.centers, ball.radii, -ball.normals, -ball.coefficients, 2)
+    loose = leaves(ball.centers, ball.radii, ball.normals, ball.coefficients, 2, oriented=False)
+    outside, inside = Camera.look_at((0, 1, 6), (0, 0, 0)), Camera.look_at((0, 0, 0), (1, 0.3, 0.2), fov=70)
+    with Renderer(device) as r:
+        for surface, camera, sign in ((ball, outside, 1), (ball, inside, 1), (turned, outside, -1),
+                                      (turned, inside, -1), (loose, outside, 1), (loose, inside, -1)):
+            frame = r.render(surface, camera, SIZE, ("mean", "gaussian", "k1", "k2", "radial"))
+            hit = np.isfinite(frame.mean)
+            assert hit.sum() > 1000
+            for name in ("mean", "k1", "k2", "radial"):
+                assert np.quantile(np.abs(frame.channels[name][hit] - sign / 2), 0.98) < 0.06, name
+            assert np.abs(np.median(frame.gaussian[hit]) - 0.25) < 0.02
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_scenes(device, torus, lanes):
+    """Patches in front have no curvature, those behind do not matter, and a second surface keeps its own."""
+    camera, names = Camera.look_at((0, 0.5, 6), (0, 0, 0)), names_of(torus.degree)
+    ball, shift = fitted(*sphere_points(600, 0.5), 0.15, torus.degree), np.eye(4)
+    shift[0, 3] = 1.0
+    plate = flat_patches()
+    with Renderer(device, lanes=lanes) as r:
+        for depth, order in ((1.5, 1), (1.5, -1), (-1.5, 1), (-1.5, -1)):
+            place = np.eye(4)
+            place[2, 3] = depth
+            frame = r.render([torus, ball.moved(shift), plate.moved(place)][::order], camera, SIZE,
+                             ("depth", "id", *names))
+            alone = r.render([torus, ball.moved(shift)], camera, SIZE, ("depth", *names))
+            patch = frame.id == (2 if order == 1 else 0)
+            seen = (frame.id >= 0) & ~patch
+            assert patch.sum() > 200 and (seen.sum() > 200)
+            for name in names:
+                got, wanted = frame.channels[name], alone.channels[name]
+                assert np.isnan(got[patch | (frame.id < 0)]).all() and np.isfinite(got[seen]).all(), name
+                assert np.array_equal(got[seen], wanted[seen]), name
+        with pytest.raises(InputError, match="degree 2 or more"):
+            r.render([torus, fitted(*torus_points(300), 0.5, 1)], camera, SIZE, ("mean",))
+        with pytest.raises(InputError, match="expected a SlimSurface"):
+            r.render(plate, camera, SIZE, ("mean",))
+
+
+def flat_patches():
+    """A square patch of 5 x 5 nodes in the plane z = 0, from (-1, -0.7) to (0.6, 0.9)."""
+    return PatchSurface(origins=[[-1.0, -0.7, 0]], axis_x=[[0.4, 0, 0]], axis_y=[[0, 0.4, 0]], axis_z_length=[0.01],
+                        size=[[5, 5]], displacements=np.zeros(25, np.int8), color=(0, 90, 0))
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+@pytest.mark.parametrize("factor", (2, 3))
+def test_supersampling(device, torus, factor, lanes):
+    """Every channel comes from the sample that the depth comes from."""
+    camera, names = cameras()[0], names_of(torus.degree)
+    large = tuple(factor * n for n in SIZE)
+    with Renderer(device, lanes=lanes) as r:
+        fine = r.render(torus, camera, large, ("depth", *names))
+        got = r.render(torus, camera, SIZE, (*names, "depth"), supersampling=factor)
+        lonely = r.render(torus, camera, SIZE, ("direction2",), supersampling=factor)
+    assert list(got.channels) == [*names, "depth"] and list(lonely.channels) == ["direction2"]
+    wanted = average({name: fine.channels[name] for name in ("depth", *names)}, factor)
+    for name in ("depth", *names):
+        assert np.array_equal(got.channels[name], wanted[name], equal_nan=True), name
+    assert np.array_equal(lonely.direction2, got.direction2, equal_nan=True)
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_lone_channels(device, lanes):
+    """Each channel alone is the one that comes with all others."""
+    surface = fitted(*torus_points(1500), 0.3, 3)
+    with Renderer(device, lanes=lanes) as r:
+        whole = r.render(surface, cameras()[0], SIZE, ALL)
+        for name in ALL:
+            lone = r.render(surface, cameras()[0], SIZE, (name,))
+            assert list(lone.channels) == [name] and lone.channels[name].dtype == np.float32
+            assert lone.channels[name].shape == (*SIZE[::-1], 3)[:2 + (DIFFERENTIALS[name][0] > 0)]
+            same = np.isclose(lone.channels[name], whole.channels[name], rtol=1e-4, atol=1e-4, equal_nan=True)
+            assert same.mean() > 0.999, name
+
+
+def test_exr_holds_them(device, tmp_path):
+    surface = fitted(*torus_points(1500), 0.3, 3)
+    with Renderer(device) as r:
+        frame = r.render(surface, cameras()[0], SIZE, ("color", *ALL))
+    frame.save(tmp_path / "torus.exr")
+    read = images.read_channels(tmp_path / "torus.exr")
+    assert np.array_equal(read["radial_derivative"], frame.radial_derivative, equal_nan=True)
+    assert np.array_equal(read["direction1.2"], frame.direction1[..., 2], equal_nan=True)
+    assert {"mean", "gaussian", "k1", "k2", "derivative1", "derivative2", "radial", "direction2.0"} <= set(read)
+
+
+# Odd input ------------------------------------------------------------------------------------------------------------
+
+
+def test_directions_are_a_frame(device, torus):
+    """Unit, tangent, at right angles; also where the sphere has no first direction."""
+    with Renderer(device) as r:
+        for surface in (torus, sphere(300)):
+            frame = r.render(surface, cameras()[0], SIZE, ("normal", "direction1", "direction2"))
+            hit = np.isfinite(frame.direction1[..., 0])
+            n, a, b = (frame.channels[name][hit] for name in ("normal", "direction1", "direction2"))
+            for x, y, wanted in ((a, a, 1), (b, b, 1), (a, b, 0), (a, n, 0), (b, n, 0)):
+                assert np.abs((x * y).sum(axis=1) - wanted).max() < 1e-4
+            assert np.abs(np.cross(n, a) - b).max() < 1e-4
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_odd_surfaces(device, lanes):
+    """Flat, seen straight on, tiny, huge and far from zero, not finite, empty: finite values or none."""
+    flat = np.zeros((1, 10))
+    bowl = np.zeros((1, 10))
+    bowl[0, 3] = bowl[0, 5] = -0.5
+    with Renderer(device, lanes=lanes) as r:
+        for size in (1e-12, 1e-6, 1.0, 1e6, 1e12):
+            for k, wanted in ((flat, 0.0), (bowl * size**-1.0, 1 / size)):
+                surface = leaves([[0, 0, 0]], [size], [[0, 0, 1.0]], k, 3, origin=(1e9 * size, 0, 0))
+                for camera in (Camera.look_at((1e9 * size, 0, 3 * size), (1e9 * size, 0, 0)),
+                               Camera.orthographic((1e9 * size, 0, 3 * size), (1e9 * size, 0, 0), height=2 * size)):
+                    frame = r.render(surface, camera, (33, 33), ("depth", *ALL))
+                    hit = np.isfinite(frame.depth)
+                    assert hit.sum() > 100
+                    for name in ALL:
+                        assert np.isfinite(frame.channels[name][hit]).all(), (name, size)
+                    assert abs(frame.mean[16, 16] - wanted) < 1e-3 / size
+                    assert np.abs(frame.k1[hit]).max() < 1.1 / size
+                    assert np.abs(frame.derivative1[hit]).max() < 1 / size**2
+        bad = leaves(np.zeros((2, 3)), [1.0, 1.0], [[0, 0, 1.0]] * 2, [[np.nan] * 10, [0] * 10], 3)
+        frame = r.render(bad, Camera.look_at((0, 0, 3), (0, 0, 0)), (33, 33), ("depth", *ALL))
+        assert np.nanmax(np.abs(frame.k1)) == 0 and np.isfinite(frame.depth).sum() > 100
+        empty = leaves(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 10)), 3)
+        frame = r.render(empty, Camera.look_at((0, 0, 3), (0, 0, 0)), (33, 33), ALL)
+        assert all(np.isnan(frame.channels[name]).all() for name in ALL)
 
 
 def test_what_has_no_curvature_is_refused(device, torus):
