@@ -9,6 +9,7 @@ from .analysis.color_maps import color_map
 from .analysis.curvature import Curvature, curvature
 from .analysis.error import SurfaceError, error
 from .analysis.line_strokes import Lines
+from .analysis.line_surface import line_surface
 from .analysis.lines import line_channels, lines
 from .analysis.smooth import smooth
 from .analysis.sparsity import slim_of_error, sparsity
@@ -41,6 +42,6 @@ __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
     "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
     "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
-    "errors", "estimate_normals", "line_channels", "lines", "load", "load_frames", "models", "open_device", "project",
-    "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
+    "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
+    "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
 ]

@@ -311,3 +311,22 @@ def test_a_closed_gap_makes_short_pieces_long_enough():
     pairs = np.concatenate([q + 6 * i for i, (_, q) in enumerate(pieces)])
     assert len(chains(points, pairs, 0, 20).closed) == 0
     assert np.diff(chains(points, pairs, 0, 20, gap=4).offset).tolist() == [24]
+
+
+@pytest.mark.parametrize("noise", (0.0, 0.001, 0.003))
+def test_noise_makes_no_lines(device, noise):
+    """The surface that lines are found on is coarser the noisier the scan; noise is over the diagonal."""
+    rng = np.random.default_rng(2)
+    scan = clsurf.models.sphere(12000)
+    points = scan.points + rng.normal(0, noise * np.linalg.norm(np.ptp(scan.bounds, axis=0)), scan.points.shape)
+    surface = clsurf.line_surface(clsurf.PointCloud(points.astype(np.float32)), device=device)
+    assert surface.degree == 3 and surface.error == pytest.approx(0.03 + 10 * max(noise - 0.0003, 0), abs=0.004)
+    frame = clsurf.render(surface, size=(300, 300), channels=clsurf.line_channels(ALL), device=device)
+    found = clsurf.lines(frame, ALL, device=device)
+    assert found.of("contours").lengths.max() > 500 and found.lengths.sum() < 1.03 * found.lengths.max()
+
+
+def test_line_surface_refuses_in_one_line(device):
+    for wrong in (3, clsurf.models.perfect_sphere(), clsurf.PointCloud(np.ones((50, 3)))):
+        with pytest.raises(InputError, match="scan: expected"):
+            clsurf.line_surface(wrong, device=device)

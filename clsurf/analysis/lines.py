@@ -64,7 +64,7 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
     ----------
     frame : Frame
         With the channels `line_channels(kinds)`, from a surface of degree 3 for the kinds that need third derivatives:
-        all but "contours" and "parabolic". A coarse surface (error 0.02 to 0.05) gives the cleaner lines.
+        all but "contours" and "parabolic". A coarse surface gives the cleaner lines: `line_surface` makes it.
     kinds : str or sequence of str
         "contours" (occluding: where the surface seen ends), "suggestive_contours" (where the radial curvature changes
         its sign), "ridges" (maxima of k1 along its direction), "valleys" (minima of k2), "crest" (those of both where

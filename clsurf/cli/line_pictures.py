@@ -15,8 +15,6 @@ LinesOption = Annotated[str, typer.Option("--lines", help="Draw feature lines: s
                                           "cubic surface than the one shown. A name in .svg gets the polylines.")]
 OnWhiteOption = Annotated[bool, typer.Option("--on-white", help="lines: draw them on white instead of over the "
                                              "shaded surface.")]
-LINE_ERROR = 0.03  # of the surface that lines are found on: a coarser one than what is shown gives the cleaner lines
-CUBIC = 3
 
 
 @dataclass(frozen=True)
@@ -40,8 +38,7 @@ class LinePicture:
         if self.kinds == ("contours",):
             return shown, shown
         with steps.step("build for lines"):
-            error = max(LINE_ERROR, 2 * shown.error) if isinstance(shown, clsurf.SlimSurface) else LINE_ERROR
-            coarse = clsurf.build_slim(thing, degree=CUBIC, error=error, device=device, progress=steps.progress)
+            coarse = clsurf.line_surface(thing, device=device, progress=steps.progress)
         steps.say(f"  {coarse}")
         return shown, coarse
 
