@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 
 from ..build.point_tree import BLOCK, PointTree
 
-SAMPLES = 1000
+SAMPLES = (1000, 8000)  # least and most, where there are so many points
+POINTS_PER_SAMPLE = 48
 RADII = 2.6 * 1.25 ** np.arange(11)  # over the point spacing, up to 24
 WIDE = (9.0, 17.0)  # radii from which half of the samples and a quarter will do: wide balls overlap
 NOISE_RADIUS = 4.0  # point spacings: the fit of degree 3 whose residual is the noise
@@ -62,8 +63,13 @@ class Fits:
     height: NDArray
 
 
-def spread_samples(tree: PointTree, wanted: int = SAMPLES) -> Samples:
-    """Return about `wanted` samples (all points of a smaller scan), evenly spread along the Morton curve."""
+def spread_samples(tree: PointTree, wanted: int | None = None) -> Samples:
+    """Return about `wanted` samples (all points of a smaller scan), evenly spread along the Morton curve.
+
+    By default one for every 48 points, 1000 to 8000.
+    """
+    if wanted is None:
+        wanted = min(max(tree.count // POINTS_PER_SAMPLE, SAMPLES[0]), SAMPLES[1])
     blocks = tree.padded // BLOCK
     chosen = (np.arange(min(wanted, blocks)) * blocks // min(wanted, blocks)).astype(np.int32)
     spacing = local_spacings(tree, chosen)
@@ -139,8 +145,8 @@ def two_degree_fits(tree: PointTree, samples: Samples, radii: NDArray = RADII) -
 def least_risk_radius(samples: Samples, fits: Fits, sigma: float, quantity: str = "curvature") -> NDArray:
     """Return the radius (s,) of a degree-2 fit that errs least in `quantity`, "curvature" (mean) or "height".
 
-    Radii are smoothed over the neighbouring samples; a fit of degree 3 takes 1.25 times, of degree 4 1.7 times as much
-    for the curvature.
+    Radii are smoothed over the neighbouring samples. For the curvature a fit of degree 3 takes 1.25 times as much, one
+    of degree 4 1.7 times on smooth surfaces (less where there is detail).
     """
     low, high = VARIANCE[quantity]
     values = fits.curvature if quantity == "curvature" else fits.height
