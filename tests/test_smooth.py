@@ -118,7 +118,7 @@ def test_borders(device):
 # How much noise goes --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("method", "left"), [("normals", 0.25), ("quadrics", 0.25), ("projection", 0.17)])
+@pytest.mark.parametrize(("method", "left"), [("normals", 0.17), ("quadrics", 0.17), ("projection", 0.17)])
 def test_a_noisy_plane_becomes_flat(device, method, left):
     vertices, faces, inside = sheet()
     noise = 0.2 * np.random.default_rng(1).normal(size=len(vertices))
@@ -141,15 +141,16 @@ def test_a_noisy_cloud_becomes_flat(device):
 
 
 def test_strength_and_iterations_smooth_more(device):
-    points, faces = ball(3000, 0.012)
-    mesh = Mesh(points, faces)
-    errors = [rms(np.linalg.norm(clsurf.smooth(mesh, strength=s, device=device).vertices + mesh.origin, axis=1) - 1)
-              for s in (0.25, 0.5, 1, 1.5)]
-    assert errors[0] < 0.012 and (np.diff(errors) < 0).all()
+    vertices, faces, inside = sheet(40)
+    vertices[:, 2] = 0.2 * np.random.default_rng(1).normal(size=len(vertices))
+    mesh = Mesh(vertices, faces)
+    left = lambda clean: rms(clean.vertices[inside, 2] + mesh.origin[2])  # noqa: E731
+    errors = [left(clsurf.smooth(mesh, strength=s, device=device)) for s in (0.25, 0.5, 1, 1.5)]
+    assert errors[0] < 0.18 and (np.diff(errors) < 0).all()
+    assert errors == [left(clsurf.smooth(mesh, strength=s, device=device)) for s in (0.25, 0.5, "auto", 1.5)]
     twice = clsurf.smooth(mesh, iterations=2, device=device)
     again = clsurf.smooth(clsurf.smooth(mesh, device=device), device=device)
-    assert (twice.vertices == again.vertices).all()
-    assert rms(np.linalg.norm(twice.vertices + mesh.origin, axis=1) - 1) < errors[2] * 1.02
+    assert (twice.vertices == again.vertices).all() and left(twice) < errors[2]
 
 
 def test_the_features_of_a_box_are_kept(device):

@@ -11,12 +11,21 @@ from ..build.point_tree import build_point_tree, column_bounds
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
 from ..surface.cloud import PointCloud
-from .smooth_fits import LAST_STEP, Queries, Rings, Samples, blended, choose_radii, guided_fits, queries_of
+from .smooth_fits import (
+    LAST_STEP,
+    SHARP,
+    Queries,
+    Rings,
+    Samples,
+    blended,
+    choose_radii,
+    guided_fits,
+    queries_of,
+)
 
 NEIGHBORS = 12  # of the spacing and of the means
 LEAST = 4  # points; fewer have no surface
 GUIDE_RADIUS, GUIDE_SHARP = 3.3, 1.0  # of the surfels whose blended normals guide the others
-SHARP = 4.0
 
 
 def smooth_points(cloud, strength: float, device: Device):

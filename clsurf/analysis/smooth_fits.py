@@ -29,12 +29,15 @@ LEVERAGE = {1.0: ([1.0, 3.0, 7.3, 11.2, 16.8, 25.0, 37.5, 56.0, 83.0, 124.0],
 SOFT = 0.01  # risks that differ by this much of the noise's variance count by 1 : 1/e in the mean radius
 RISK_ROUNDS, RADIUS_ROUNDS = 16, 5  # of means over neighbours: of squared residuals, of radii
 RADIUS_SHARE = 0.84  # of the radius of least risk of heights: normals ask for a little less bias
-OUTLIER = 5.0  # noise levels; larger residuals count as this
+OUTLIER = 5.0  # times the residuals around; larger ones count as this
+CLEARLY = 3.0  # ratio of noise variances
+LEAST_NOISE = 1e-14  # of a scan of diagonal 1: float32 rounds to 6e-8
 FIT_SHARE = 1.31  # residuals have 1 - FIT_SHARE leverage of the noise's variance: the fit itself 0.69 of its leverage
 # Shapes with sharp edges: the excess of squared residuals at 4 spacings under weights that fall with the angle, over
 # that under weights that hardly do, was 0.05 on fandisk, 0.1 on a noisy cube, 0.74 to 0.93 on five scans of statues.
 EDGE_RADIUS, EDGE_BLIND, EDGE_SHARE = 3, 2.0, 0.4
 NOISE_SHARE = 0.9  # of the noise's variance that is surely noise: the estimate is 0 to 15 % high
+SHARP = 6.0  # of the weights of fits and blend, of shapes without sharp edges
 # Every STEP k^2-th independent point is a centre, k the radius over the spacing: 15 surfels overlap at each point.
 STEP, LAST_STEP = 0.25, 0.1  # while radii are chosen; for the result, 0.5 % less error
 
@@ -214,17 +217,17 @@ def choose_radii(samples: Samples, queries: Queries, rings: Rings, sharp: float)
         Neighbours of the queries.
     """
     residual2, own = [], []
-    noise2 = weight = None
     for k, factor in enumerate(RADII):
         offset, _, _, _, points = blended(guided_fits(samples, factor * samples.spacing, sharp), queries)
         residual2.append(offset * offset)
         own.append(leverage(points, samples.points_per_vertex))
         if k < FIRST_RADII - 1:
             continue
-        if noise2 is None:
+        if k == FIRST_RADII - 1:
             noise2 = noise_variance(residual2[NOISE_RADIUS], own[NOISE_RADIUS])
-        squares = np.minimum(np.stack(residual2, axis=1), OUTLIER**2 * noise2)
-        risk = rings.means(squares, RISK_ROUNDS) / noise2 + 2 * np.stack(own, axis=1) - 1
+            limit = OUTLIER**2 * rings.means(residual2[NOISE_RADIUS][:, None], RISK_ROUNDS)
+        mean2, share = rings.means(np.minimum(np.stack(residual2, axis=1), limit), RISK_ROUNDS), np.stack(own, axis=1)
+        risk = mean2 / local_noise(mean2, share, noise2) + 2 * share
         weight = np.exp((risk.min(axis=1, keepdims=True) - risk) / SOFT)
         weight /= weight.sum(axis=1, keepdims=True)
         if weight[:, -1].mean() < LARGE_SHARE:
@@ -232,6 +235,16 @@ def choose_radii(samples: Samples, queries: Queries, rings: Rings, sharp: float)
     factor = np.exp(rings.means(weight @ np.log(RADII[:weight.shape[1], None]), RADIUS_ROUNDS)[:, 0])
     return Choice(RADIUS_SHARE * factor, float(np.sqrt(noise2)),
                   excess_of(residual2[EDGE_RADIUS], own[EDGE_RADIUS], noise2))
+
+
+def local_noise(mean2: NDArray, own: NDArray, noise2: float) -> NDArray:
+    """Return the noise variance (n, 1) at every query: the scan's, unless the place speaks clearly against it.
+
+    Generalised cross-validation tells the noise from mean squared residuals (n, r) of fits with leverage `own`. Taken
+    everywhere it costs 1 % of error on evenly noisy meshes; so the scan's noise stands where the two agree to CLEARLY.
+    """
+    here = (mean2 / np.maximum(1 - own, 0.2) ** 2).min(axis=1, keepdims=True)
+    return np.maximum(np.clip(noise2, here / CLEARLY, here * CLEARLY), LEAST_NOISE)
 
 
 def excess_of(residual2: NDArray, own: NDArray, noise2: float) -> float:
@@ -252,4 +265,4 @@ def noise_variance(residual2: NDArray, own: NDArray) -> float:
     """Return the noise variance from squared residuals (n,) of fits with leverage `own`; never 0."""
     # 0.455: the median of a squared unit normal variable.
     found = float(np.median(residual2 / np.maximum(1 - FIT_SHARE * own, 0.1))) / 0.455
-    return max(found, 1e-14)
+    return max(found, LEAST_NOISE)

@@ -3,7 +3,7 @@
 // over, a vertex also moves within the surface, toward the mean of its faces' centroids.
 // Source of the step: Sun, Rosin, Martin, Langbein, "Fast and Effective Feature-Preserving Mesh Denoising", 2007.
 #ifndef FOLDED
-#define FOLDED 0.3f // cosine between a face's own normal and the wanted one
+#define FOLDED 0.5f // cosine between a face's own normal and the wanted one
 #endif
 
 // kind: 1 moves, 3 relaxes too, 0 stays. wanted: rows of 4 floats a face, unit normals.

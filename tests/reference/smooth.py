@@ -83,7 +83,7 @@ def move_vertices(vertices, faces, wanted, kind, relax):
         away = v[faces[mine]].mean(axis=1) - v[i]
         n = wanted[mine]
         out[i] += ((away * n).sum(axis=1)[:, None] * n).mean(axis=0)
-        if kind[i] == 3 and ((own[mine] * n).sum(axis=1) < 0.3).any():
+        if kind[i] == 3 and ((own[mine] * n).sum(axis=1) < 0.5).any():
             axis = n.sum(axis=0) / np.linalg.norm(n.sum(axis=0))
             out[i] += relax * (away.mean(axis=0) - away.mean(axis=0) @ axis * axis)
     return out
