@@ -122,6 +122,10 @@ def test_lines_do_not_depend_on_units_or_place(device):
     assert len(one) == len(other) > 3
     assert np.abs(one.points - other.points).max() < 1e-2
     assert np.abs((other.positions - shift) / scale - one.positions).max() < 1e-4
+    assert other.unit == pytest.approx(one.unit / scale, rel=1e-5)
+    same = clsurf.lines(Frame(channels, camera=TORUS_CAMERA), ALL, detail=5, unit=one.unit, device=device)
+    fewer = clsurf.lines(Frame(channels, camera=TORUS_CAMERA), ALL, detail=5, unit=10 * one.unit, device=device)
+    assert np.array_equal(same.points, one.points) and len(fewer) < len(one)
 
 
 def test_lines_of_a_rendered_surface(device):
@@ -152,6 +156,8 @@ def test_a_finer_silhouette_gives_the_contours_and_hides_lines(device):
     found = clsurf.lines(big, kinds, silhouette=small, device=device)
     own = clsurf.lines(small, "contours", device=device)
     assert np.array_equal(found.of("contours").points, own.points)
+    alone = clsurf.lines(big, "contours", silhouette=small, device=device)
+    assert np.array_equal(alone.points, own.points)
     x, y = found.of("parabolic").points.astype(int).T
     assert np.isfinite(small.depth[y, x]).all()
     assert found.of("parabolic").lengths.sum() < clsurf.lines(big, "parabolic", device=device).lengths.sum() + 1
@@ -271,7 +277,8 @@ def test_frames_that_cannot_be_used(device):
         clsurf.lines(Frame(frame.channels), "ridges", device=device)
     with pytest.raises(InputError, match="silhouette: expected the frame's size"):
         clsurf.lines(frame, "ridges", silhouette=exact(Torus(), TORUS_CAMERA, (17, 16)), device=device)
-    for option in ({"smoothing": 3}, {"smoothing": float("nan")}, {"detail": 0}, {"length": -1}, {"length": "x"}):
+    for option in ({"smoothing": 3}, {"smoothing": float("nan")}, {"detail": 0}, {"length": -1}, {"length": "x"},
+                   {"gap": -1}, {"unit": 0}, {"unit": float("inf")}):
         with pytest.raises(InputError, match=f"{next(iter(option))}: expected a number from"):
             clsurf.lines(frame, "ridges", device=device, **option)
     found = clsurf.lines(frame, "contours", device=device)

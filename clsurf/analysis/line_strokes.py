@@ -43,6 +43,8 @@ class Lines:
         Index into `kinds`.
     closed : (k,) bool
         Whether the last vertex is joined to the first.
+    unit : float
+        Curvature (1 / world unit) that the thresholds were multiples of.
     device : Device, optional
         What draws them.
     """
@@ -55,6 +57,7 @@ class Lines:
     offset: NDArray
     kind: NDArray
     closed: NDArray
+    unit: float = 1.0
     device: object = None
 
     def __post_init__(self):

@@ -6,6 +6,8 @@ and crest lines: Ohtake, Belyaev, Seidel, "Ridge-Valley Lines on Meshes via Impl
 """
 
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..device import open_device
@@ -34,6 +36,24 @@ MEDIAN_STEP = 4  # every 4th pixel each way gives the median of |H|
 HIDDEN_FOOTPRINTS = 16.0  # a line so far behind the silhouette's surface is hidden
 
 
+@dataclass(frozen=True)
+class Limits:
+    """The options of `lines` that are numbers, checked."""
+
+    smoothing: float  # pixels
+    detail: float
+    length: float  # pixels
+    gap: float  # pixels
+    unit: float  # 1 / world unit
+
+    def __post_init__(self):
+        for name, low, high in (("smoothing", 0, 2.6), ("detail", 1e-3, 1e3), ("length", 0, 1e6), ("gap", 0, 1e3),
+                                ("unit", 1e-30, 1e30)):
+            value = getattr(self, name)
+            if not isinstance(value, int | float | np.number) or not low <= value <= high:
+                raise InputError(f"{name}: expected a number from {low:g} to {high:g}, got {value!r}")
+
+
 def line_channels(kinds) -> tuple[str, ...]:
     """Return the channels that `lines` needs of a frame, for `render(..., channels=...)`.
 
@@ -57,7 +77,8 @@ def line_channels(kinds) -> tuple[str, ...]:
 
 
 def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None = None, smoothing: float = 1.3,
-          detail: float = 1.0, length: float | None = None, gap: float | None = None, device=None) -> Lines:
+          detail: float = 1.0, length: float | None = None, gap: float | None = None, unit: float | None = None,
+          device=None) -> Lines:
     """Find feature lines in a picture, as polylines with sub-pixel vertices.
 
     Parameters
@@ -81,6 +102,9 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
         picture's longer side. Occluding contours: at most 12.
     gap : float, optional
         Pixels; shorter gaps in a line are closed; by default 0.6 % of the longer side, at least 3.
+    unit : float, optional
+        Curvature (1 / world unit) that all thresholds are multiples of; by default the median size of the mean
+        curvature over the picture. Give the `unit` of the first frame's lines to the other frames of an animation.
     device : None, str or Device
 
     Returns
@@ -91,16 +115,13 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
     ------
     InputError
         An unknown kind, a frame without a camera or without a channel that is needed, an option out of range.
-
-    Notes
-    -----
-    Strengths are relative to the median size of the mean curvature over the picture, so nothing depends on units.
     """
     kinds = checked_kinds(kinds)
-    check_frame("frame", frame, line_channels([kind for kind in kinds if kind != "contours" or silhouette is None]))
-    length = 0.015 * max(frame.size) if length is None else length
-    gap = max(0.006 * max(frame.size), 3.0) if gap is None else gap
-    _check_options(smoothing, detail, length, gap)
+    check_frame("frame", frame, line_channels(kinds))
+    if unit is None:
+        unit = median_curvature(frame) if "mean" in frame.channels else 1.0
+    limits = Limits(smoothing, detail, 0.015 * max(frame.size) if length is None else length,
+                    max(0.006 * max(frame.size), 3.0) if gap is None else gap, unit)
     if silhouette is not None:
         check_frame("silhouette", silhouette, ("depth", "normal"))
         if silhouette.size != frame.size:
@@ -110,35 +131,36 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
     planes = LinePlanes(device, frame)
     for number, kind in enumerate(kinds):
         if kind != "contours":
-            parts += [(number, part) for part in _field_lines(planes, kind, silhouette, smoothing, detail, length, gap)]
+            parts += [(number, part) for part in _field_lines(planes, kind, silhouette, limits)]
     if "contours" in kinds:  # last: the other frame's planes take the place of this one's
         outline = planes if silhouette is None else LinePlanes(device, silhouette)
-        parts.append((kinds.index("contours"), _contours(outline, min(length, CONTOUR_LENGTH), gap)))
-    return _joined(frame, kinds, sorted(parts, key=lambda part: part[0]), device)
+        parts.append((kinds.index("contours"), _contours(outline, limits)))
+    return _joined(frame, kinds, sorted(parts, key=lambda part: part[0]), unit, device)
 
 
-def _field_lines(planes: LinePlanes, kind, silhouette, smoothing, detail, length, gap) -> list[Chains]:
+def _field_lines(planes: LinePlanes, kind, silhouette, limits: Limits) -> list[Chains]:
     """Return the lines of one kind, their strengths from 0 to 1."""
     out = []
     for field in FIELDS[kind]:
-        unit = median_curvature(planes.frame)**field.power / detail
-        found = planes.field_crossings(field, smoothing, field.least * unit)
+        unit = limits.unit**field.power / limits.detail
+        found = planes.field_crossings(field, limits.smoothing, field.least * unit)
         if silhouette is not None:
             found = found.chosen(_shown(silhouette, found.points))
         pairs = cell_segments(found, contours=False)
         found.points[:, 3] = np.sqrt(np.clip(found.points[:, 3] / (field.full * unit), 0, 1))
-        joined = chains(found.points, pairs, np.sqrt(field.peak / field.full), length, gap,
+        joined = chains(found.points, pairs, np.sqrt(field.peak / field.full), limits.length, limits.gap,
                         GAP_STEEPNESS * footprint(planes.frame), RING)
         points = relaxed(joined, ROUNDS)
         out.append(Chains(points, joined.offset, joined.closed))
     return out
 
 
-def _contours(planes: LinePlanes, length, gap) -> Chains:
+def _contours(planes: LinePlanes, limits: Limits) -> Chains:
     found = planes.contour_crossings()
     pairs = cell_segments(found, contours=True)
     found.points[:, 3] = 1
-    joined = chains(found.points, pairs, 0.0, length, gap, GAP_STEEPNESS * footprint(planes.frame))
+    joined = chains(found.points, pairs, 0.0, min(limits.length, CONTOUR_LENGTH), limits.gap,
+                    GAP_STEEPNESS * footprint(planes.frame))
     return Chains(relaxed(joined, CONTOUR_ROUNDS), joined.offset, joined.closed)
 
 
@@ -159,7 +181,7 @@ def _shown(silhouette: Frame, points):
         return points[:, 2] - depth <= HIDDEN_FOOTPRINTS * footprint
 
 
-def _joined(frame, kinds, parts, device) -> Lines:
+def _joined(frame, kinds, parts, unit, device) -> Lines:
     """Return all lines of all kinds in one result."""
     points = np.concatenate([np.empty((0, 4), np.float32), *(part.points for _, part in parts)])
     counts = np.concatenate([np.empty(0, np.int64), *(np.diff(part.offset) for _, part in parts)])
@@ -168,7 +190,7 @@ def _joined(frame, kinds, parts, device) -> Lines:
         size=frame.size, kinds=kinds, points=points[:, :2], positions=world_positions(frame, points),
         strength=points[:, 3], offset=np.concatenate([[0], np.cumsum(counts)]),
         kind=np.concatenate([np.empty(0, np.int32), *numbers]),
-        closed=np.concatenate([np.empty(0, bool), *(part.closed for _, part in parts)]), device=device)
+        closed=np.concatenate([np.empty(0, bool), *(part.closed for _, part in parts)]), unit=unit, device=device)
 
 
 def world_positions(frame: Frame, points) -> np.ndarray:
@@ -209,10 +231,3 @@ def check_frame(name: str, frame, channels) -> None:
     if missing:
         raise InputError(f"{name}: expected the channels {', '.join(channels)}, got none of the name "
                          f"{', '.join(missing)}: ask for them with render(..., channels=clsurf.line_channels(kinds))")
-
-
-def _check_options(smoothing, detail, length, gap) -> None:
-    for name, value, low, high in (("smoothing", smoothing, 0, 2.6), ("detail", detail, 1e-3, 1e3),
-                                   ("length", length, 0, 1e6), ("gap", gap, 0, 1e3)):
-        if not isinstance(value, int | float | np.number) or not low <= value <= high:
-            raise InputError(f"{name}: expected a number from {low:g} to {high:g}, got {value!r}")
