@@ -16,7 +16,7 @@ from clsurf.render.patch_mips import halved, mip_levels, tent
 from clsurf.render.patches import place_patches, project_patches, upload_patches
 from clsurf.render.renderer import Renderer
 from clsurf.render.shade import Shading
-from clsurf.render.tiles import Scratch, view_floats
+from clsurf.render.tiles import view_floats
 from clsurf.surface.patch import PatchSurface
 from clsurf.surface.srgb import to_linear
 
@@ -134,9 +134,9 @@ def test_cull_patches(device, camera, bump):
                   for cull in (False, True)]
     for name, array in frames[0].channels.items():
         assert np.array_equal(array, frames[1].channels[name], equal_nan=True)
-    upload, scratch = upload_patches(device, surface), Scratch(device, 16)
+    upload = upload_patches(device, surface)
     view = device.upload(place_patches(upload, None, camera, SIZE, Shading()))
-    projected = project_patches(device, scratch, upload, view, PatchDrawing())
+    projected = project_patches(device, upload, view, PatchDrawing())
     before = device.download(projected.rectangles)
     cull_patches(device, upload, upload, 1, None, view, projected)
     after = device.download(projected.rectangles)

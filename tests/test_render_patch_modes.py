@@ -147,7 +147,7 @@ def test_light_nodes(device, camera, lanes):
     floats = place_patches(upload, matrix, camera, (500, 400), shading)
     lamps = shading_floats(shading, LIGHTS, (1, 1, 1), camera)
     view = device.upload(floats)
-    rectangles = project_patches(device, scratch, upload, view, PatchDrawing()).rectangles
+    rectangles = project_patches(device, upload, view, PatchDrawing()).rectangles
     got = device.download(light_nodes(device, scratch, upload, patch_constants(upload), view, device.upload(lamps),
                                       rectangles))
     got = np.stack([got[:, 1] & 0xFFFF, got[:, 1] >> 16, got[:, 2] & 0xFFFF], axis=1) * LIT_RANGE / 65535

@@ -64,7 +64,7 @@ def test_table_normals(device, mode, colors):
     surface = rough(9, ratios=ratios, colors=colors)
     upload, scratch = upload_patches(device, surface), Scratch(device, 16)
     view = device.upload(place_patches(upload, None, Camera.framing(surface, margin=1.3), (200, 200), Shading()))
-    rectangles = project_patches(device, scratch, upload, view, PatchDrawing()).rectangles
+    rectangles = project_patches(device, upload, view, PatchDrawing()).rectangles
     seen = device.download(rectangles)[:, 0] <= device.download(rectangles)[:, 2]
     got, counts = table_normals(device, scratch, upload, patch_constants(upload), rectangles, mode, parts=1)
     statistics = normal_statistics(surface, seen)

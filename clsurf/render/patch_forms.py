@@ -1,9 +1,10 @@
 """The forms of a surface that modes draw: with coarser levels for minification, with nodes carried on for alpha.
 
-A form is uploaded when the first frame needs it. Kernels: kernels/render/*_levels.cl, pack_alphas.cl, cull_patches.cl.
+A form is uploaded when the first frame needs it. Kernels: kernels/render/patch_levels.clh, pack_alphas.cl and
+cull_patches.cl.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from ..device import Device, DeviceArray
 from ..surface.patch import PatchSurface, facet_cones
 from .patch_alpha import extended
 from .patch_mips import with_levels
-from .tiles import Scratch
 
 LEVELS = 8  # most levels of a surface
 WIDEST_SPACING_PX = 1.0  # the coarsest level whose nodes are at most this far apart is drawn
@@ -73,25 +73,6 @@ def _least_spacing(surface: PatchSurface) -> float:
                for axis in (surface.axis_x, surface.axis_y))
 
 
-def select_levels(device: Device, scratch: Scratch, form: Form, view: DeviceArray):
-    """Choose a level for every patch; return the upload of the chosen ones, and the levels (p,) int32."""
-    all_ = form.upload
-    count = all_.count // form.levels
-    frames = scratch.array("level_frames", (max(count, 1), all_.frames.shape[1]), np.float32)
-    sizes = scratch.array("level_sizes", (max(count, 1), 2), np.int32)
-    offsets = scratch.array("level_offsets", (count + 1,), np.uint32)
-    levels = scratch.array("levels", (max(count, 1),), np.int32)
-    device.kernel("render/select_levels.cl")(
-        (count + 1,), (16,), view, all_.frames, all_.sizes, all_.offsets, count, form.levels, WIDEST_SPACING_PX, frames,
-        sizes, offsets, levels)
-    return replace(all_, count=count, frames=frames, sizes=sizes, offsets=offsets, equal_nodes=0), levels
-
-
-def mark_levels(device: Device, records: DeviceArray, levels: DeviceArray, count: int) -> None:
-    """Write the levels into the flags of projected patches."""
-    device.kernel("render/mark_levels.cl")((count,), (16,), records, records.shape[1], levels, count)
-
-
 def cull_patches(device: Device, upload, whole, levels_count: int, levels: DeviceArray | None, view: DeviceArray,
                  projected) -> None:
     """Mark the patches that are seen from behind only as not in the picture; surfaces without orientation keep all.
@@ -102,7 +83,7 @@ def cull_patches(device: Device, upload, whole, levels_count: int, levels: Devic
     if cones is not None and upload.count:
         device.kernel("render/cull_patches.cl")(
             (upload.count,), (16,), view, upload.frames, upload.sizes, upload.count, cones, levels_count,
-            upload.sizes if levels is None else levels, projected.rectangles, projected.boxes)
+            upload.sizes if levels is None else levels, projected.rectangles, projected.boxes.shape[1], projected.boxes)
 
 
 def _cones(device, surface):

@@ -42,7 +42,7 @@ def tile_patches(device: Device, scratch: Scratch, grid: Grid, upload, constants
     channels = out or {}
     tiles_x, tiles_y = -(-grid.bins_x // grid.patch_bins), -(-grid.bins_y // grid.patch_bins)
     device.kernel("render/tile_patches.cl", constants=constants)(
-        (tiles_x * tiles_y * group,), (group,), view, projected.boxes, projected.records, upload.sizes, upload.offsets,
-        upload.count, upload.steps, upload.rims, upload.nodes, twists, number, tiles_x, tiles_x * tiles_y,
-        grid.bins_x, grid.bins_y, grid.touched or unused, grid.planes or unused,
+        (tiles_x * tiles_y * group,), (group,), view, projected.boxes, projected.boxes.shape[1], projected.records,
+        upload.sizes, upload.offsets, upload.count, upload.steps, upload.rims, upload.nodes, twists, number, tiles_x,
+        tiles_x * tiles_y, grid.bins_x, grid.bins_y, grid.touched or unused, grid.planes or unused,
         *(channels.get(name, unused) for name in CHANNELS))

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..surface.patch import PatchSurface
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
 from .patch_drawing import PatchDrawing
-from .patch_forms import cull_patches, mark_levels, select_levels, surface_form
+from .patch_forms import WIDEST_SPACING_PX, cull_patches, surface_form
 from .patch_lattice import CELLS
 from .patch_nodes import LIT_UNIT, light_nodes, table_normals
 from .patch_tiles import NODES, PAD, tile_patches
@@ -70,7 +70,9 @@ class Projected:
 
     records: DeviceArray  # (count, PATCH_FLOATS, with trilinear nodes 24 more) float32: kernels/common/patch.clh
     rectangles: DeviceArray  # (count, 4) int32: first and last pixel that a patch may touch; first > last: none
-    boxes: DeviceArray  # (count, 4) int16: the same in bins
+    boxes: DeviceArray  # (4, at least count) int16: the same in bins, all first x, all first y, all last x, all last y
+    upload: PatchUpload  # of the patches that are drawn: where patches have levels, of the chosen ones
+    levels: DeviceArray | None  # (count,) int32: those levels
 
 
 def patch_constants(upload: PatchUpload) -> dict[str, int]:
@@ -127,10 +129,12 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
 
 def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, shading: Shading) -> NDArray:
     """Return the view buffer of a placed surface, kernels/common/view.clh and patch.clh."""
-    matrix = np.eye(4) if matrix is None else matrix
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    rotation = camera.rotation @ (matrix[:3, :3] / scale)
-    offset = camera.rotation @ (matrix[:3, :3] @ upload.origin + matrix[:3, 3] - camera.eye)
+    if matrix is None:
+        scale, rotation, offset = 1.0, camera.rotation, camera.rotation @ (upload.origin - camera.eye)
+    else:
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        rotation = camera.rotation @ (matrix[:3, :3] / scale)
+        offset = camera.rotation @ (matrix[:3, :3] @ upload.origin + matrix[:3, 3] - camera.eye)
     middle, reach = -(scale * rotation[2] @ upload.center + offset[2]), scale * upload.reach
     first = middle - reach
     if camera.projection(size).perspective:
@@ -144,19 +148,34 @@ def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, sha
     return view
 
 
-def project_patches(device: Device, scratch: Scratch, upload: PatchUpload, view: DeviceArray,
-                    drawing: PatchDrawing) -> Projected:
-    """Project the patches; find out what they may touch and how they are drawn."""
+def project_patches(device: Device, upload: PatchUpload, view: DeviceArray, drawing: PatchDrawing,
+                    levels: int = 1) -> Projected:
+    """Project the patches of an upload, with several `levels` a patch the coarsest that shows every pixel's detail.
+
+    The arrays are the upload's own: valid until its patches are projected again.
+    """
     nodes = NODES[drawing.nodes]
-    records = scratch.array("patch_records", (upload.count, PATCH_FLOATS + 24 * (nodes > 0)), np.float32)
-    rectangles = scratch.array("patch_rectangles", (upload.count, 4), np.int32)
-    boxes = scratch.array("patch_boxes", (upload.count, 4), np.int16)
+    out = upload.once(("projected", bool(nodes), levels), lambda _: _new_projected(device, upload, nodes, levels))
+    chosen = out.upload
     device.kernel("render/project_patches.cl", constants=patch_constants(upload) | {
-        "NODES": nodes, "OVERSHOOT": "0.3f" if drawing.cells == "smooth" else "0.0f",
+        "NODES": nodes, "OVERSHOOT": "0.3f" if drawing.cells == "smooth" else "0.0f", "LEVELS": levels > 1,
         "DIRECT": drawing.direct and drawing.cells not in CELLS and not drawing.alpha})(
-        (upload.count,), (min(64, upload.count),), view, upload.frames, upload.sizes, upload.count, records, rectangles,
-        boxes)
-    return Projected(records, rectangles, boxes)
+        (chosen.count + 1,), (16,), view, upload.frames, upload.sizes, upload.offsets, chosen.count, levels,
+        WIDEST_SPACING_PX, out.boxes.shape[1], out.records, out.rectangles, out.boxes, chosen.frames, chosen.sizes,
+        chosen.offsets, chosen.sizes if out.levels is None else out.levels)
+    return out
+
+
+def _new_projected(device, upload, nodes, levels) -> Projected:
+    count = upload.count // levels
+    room, chosen = max(count, 1), None
+    if levels > 1:
+        upload = replace(upload, count=count, frames=device.empty((room, FRAME_FLOATS), np.float32), equal_nodes=0,
+                         sizes=device.empty((room, 2), np.int32), offsets=device.empty((count + 1,), np.uint32))
+        chosen = device.empty((room,), np.int32)
+    return Projected(device.empty((room, PATCH_FLOATS + 24 * bool(nodes)), np.float32),
+                     device.empty((room, 4), np.int32), device.empty((4, -(-room // PAD) * PAD), np.int16), upload,
+                     chosen)
 
 
 def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpload, matrix, camera, look: Look,
@@ -183,16 +202,13 @@ def shade_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpl
 
 def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, out=None) -> None:
     """Run the stages of one surface: project, work at the nodes where a mode asks for it, tile."""
-    drawing, levels = look.patches, None
+    drawing = look.patches
     form = surface_form(device, upload, upload_patches, floats, drawing)
-    whole = upload = upload if form is None else form.upload
-    if form is not None and form.levels > 1:
-        upload, levels = select_levels(device, scratch, form, view)
-    projected = project_patches(device, scratch, upload, view, drawing)
-    if levels is not None:
-        mark_levels(device, projected.records, levels, upload.count)
+    whole, levels = (upload, 1) if form is None else (form.upload, form.levels)
+    projected = project_patches(device, whole, view, drawing, levels)
+    upload = projected.upload
     if drawing.cull and drawing.cells != "smooth":  # the cones hold the normals of facets
-        cull_patches(device, upload, whole, 1 if levels is None else form.levels, levels, view, projected)
+        cull_patches(device, upload, whole, levels, projected.levels, view, projected)
     constants = patch_constants(upload)
     if drawing.normal_table:
         nodes, _ = table_normals(device, scratch, upload, constants, projected.rectangles, drawing.normal_table)

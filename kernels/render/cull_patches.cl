@@ -5,7 +5,7 @@
 
 __kernel void cull_patches(__global const float *view, __global const float *frames, __global const int *sizes, int count,
                            __global const float4 *cones /* axis, half angle */, int levels, __global const int *chosen,
-                           __global int4 *rectangles, __global short4 *boxes) {
+                           __global int4 *rectangles, int stride, __global short *boxes) {
   int k = get_global_id(0);
   if (k >= count) return;
   __global const float *f = frames + (size_t)k * FRAME_FLOATS;
@@ -35,6 +35,7 @@ __kernel void cull_patches(__global const float *view, __global const float *fra
   float off = acos(clamp(along / distance, -1.0f, 1.0f));
   if (off - cone.w - asin(reach / distance) > M_PI_2_F + 0.001f) {
     rectangles[k] = (int4)(1, 1, 0, 0);
-    boxes[k] = (short4)(32767, 32767, -1, -1);
+    boxes[k] = boxes[stride + k] = 32767;
+    boxes[2 * stride + k] = boxes[3 * stride + k] = -1;
   }
 }

@@ -2,12 +2,19 @@
 // work-item per patch. Twin: tests/reference/render_patches.py, project_patches.
 //
 // The rectangle (first x, first y, last x, last y; first > last: not in the picture) is that of the eight corners of the
-// box around the patch's displacements; a patch that reaches the near plane gets the whole picture.
-#include "common/patch.clh"
+// box around the patch's displacements; a patch that reaches the near plane gets the whole picture. `boxes`: the same in
+// bins, first x of all patches, then first y, last x and last y, `stride` apart.
+//
+// With several levels a patch, level l of patch k is patch k * levels + l of the surface, and the chosen ones' frames, sizes
+// and first nodes are written as well.
 #include "common/bins.clh"
+#include "render/patch_levels.clh"
 
 #ifndef NODES
 #define NODES 0   // 0: exact projection; 1: trilinear from the box's corners, 2: the same before the division
+#endif
+#ifndef LEVELS
+#define LEVELS 0  // 1: there are several levels a patch
 #endif
 #ifndef OVERSHOOT
 #define OVERSHOOT 0.0f  // of the largest difference: smooth cells rise above their nodes, by an eighth of it each way
@@ -43,10 +50,26 @@ inline void turned(__global const float *view, __global const float *v, float *o
 }
 
 __kernel void project_patches(__global const float *view, __global const float *frames, __global const int *sizes,
-                              int count, __global float *records, __global int4 *rectangles, __global short4 *boxes) {
-  int k = get_global_id(0);
+                              __global const uint *offsets, int count, int levels, float widest, int stride,
+                              __global float *records, __global int4 *rectangles, __global short *boxes,
+                              __global float *chosen_frames, __global int *chosen_sizes, __global uint *chosen_offsets,
+                              __global int *chosen) {
+  int k = get_global_id(0), level = 0, from = k;
+#if LEVELS
+  if (k == count) chosen_offsets[k] = offsets[count * levels];
+#endif
   if (k >= count) return;
-  __global const float *f = frames + (size_t)k * FRAME_FLOATS;
+#if LEVELS
+  from = k * levels;
+  level = level_of(view, frames + (size_t)from * FRAME_FLOATS, sizes + 2 * from, levels, widest);
+  from += level;
+  for (int i = 0; i < FRAME_FLOATS; i++)
+    chosen_frames[(size_t)k * FRAME_FLOATS + i] = frames[(size_t)from * FRAME_FLOATS + i];
+  chosen_sizes[2 * k] = sizes[2 * from]; chosen_sizes[2 * k + 1] = sizes[2 * from + 1];
+  chosen_offsets[k] = offsets[from];
+  chosen[k] = level;
+#endif
+  __global const float *f = frames + (size_t)from * FRAME_FLOATS;
   __global float *h = records + (size_t)k * PATCH_STRIDE;
   int perspective = view[PERSPECTIVE] > 0.0f;
   float scale = view[SCALE], v[3];
@@ -69,7 +92,7 @@ __kernel void project_patches(__global const float *view, __global const float *
     h[NX + part] = v[0] * share[part]; h[NY + part] = v[1] * share[part]; h[NZ + part] = v[2] * share[part];
   }
   float more = OVERSHOOT * f[LARGEST_STEP], low = f[LOW_STEP] - more, high = f[HIGH_STEP] + more;
-  float near = view[NEAR], m = sizes[2 * k] - 1, n = sizes[2 * k + 1] - 1;
+  float near = view[NEAR], m = sizes[2 * from] - 1, n = sizes[2 * from + 1] - 1;
   float x0 = INFINITY, y0 = INFINITY, x1 = -INFINITY, y1 = -INFINITY, front = INFINITY, back = -INFINITY;
 #if NODES
   float extent = high > low ? high - low : 1.0f, corners[3][8];
@@ -103,7 +126,7 @@ __kernel void project_patches(__global const float *view, __global const float *
     if (DIRECT && wide <= 1.0f && tall <= 1.0f) flags = PATCH_DIRECT;
     if (wide > LARGE_PX || tall > LARGE_PX) flags = PATCH_LARGE;
   }
-  h[PATCH_FLAGS] = as_float(flags);
+  h[PATCH_FLAGS] = as_float(flags | level << PATCH_LEVEL);
   h[PATCH_NEAR] = front > near ? front : near;
   h[SLOPE_SCALE] = f[SCALE_OF_SLOPES];
   // 1/32 pixel covers float rounding.
@@ -111,6 +134,8 @@ __kernel void project_patches(__global const float *view, __global const float *
   y0 = MORE(ceil(y0 - 0.53125f), 0.0f); y1 = LESS(floor(y1 - 0.46875f), view[HEIGHT] - 1.0f);
   int shown = f[LOW_STEP] <= f[HIGH_STEP] && back > near && x0 <= x1 && y0 <= y1;
   rectangles[k] = shown ? (int4)((int)x0, (int)y0, (int)x1, (int)y1) : (int4)(1, 1, 0, 0);
-  boxes[k] = shown ? (short4)((short)(x0 / BIN), (short)(y0 / BIN), (short)(x1 / BIN), (short)(y1 / BIN))
-                   : (short4)(32767, 32767, -1, -1);
+  boxes[k] = shown ? x0 / BIN : 32767;
+  boxes[stride + k] = shown ? y0 / BIN : 32767;
+  boxes[2 * stride + k] = shown ? x1 / BIN : -1;
+  boxes[3 * stride + k] = shown ? y1 / BIN : -1;
 }

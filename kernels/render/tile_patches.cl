@@ -7,14 +7,20 @@
 #include "render/patch_winners.clh"
 
 #if VW > 1
+typedef CAT(short, VW) __attribute__((aligned(2))) BoxesAt;
+#define BOXES_AT(at) TO_VI(*(__global const BoxesAt *)(boxes + (at)))
+
 // The largest key of a bin of the tile: what lies behind it cannot show there.
 INLINE uint farthest_of(const ulong *slots, int bin) {
-  ulong most = 0;
-  for (int q = 0; q < 4; q++) {
-    const ulong *block = slots + 16 * ((bin / TILE_BINS * 2 + (q >> 1)) * BLOCKS + bin % TILE_BINS * 2 + (q & 1));
-    for (int i = 0; i < 16; i++) most = block[i] > most ? block[i] : most;
+  const ulong *row = slots + (bin / TILE_BINS * TILE + bin % TILE_BINS) * BIN;
+  ulong8 most = *(const ulong8 *)row;
+  for (int y = 1; y < BIN; y++) {
+    ulong8 next = *(const ulong8 *)(row + y * TILE);
+    most = next > most ? next : most;
   }
-  return (uint)(most >> 32);
+  ulong4 four = most.lo > most.hi ? most.lo : most.hi;
+  ulong2 two = four.lo > four.hi ? four.lo : four.hi;
+  return (uint)((two.x > two.y ? two.x : two.y) >> 32);
 }
 #endif
 
@@ -27,6 +33,10 @@ INLINE void draw_hit(Target *to, Patches patches, Nodes nodes, int k, int4 box, 
   int flags = as_int(h[PATCH_FLAGS]);
   uint first = patches.offsets[k];
   to->limits = box;
+#if VW > 1
+  // What shows will be read in no order.
+  for (int i = 0; i < m * n && !(flags & PATCH_LARGE); i += 4) PREFETCH(nodes.nodes + first + i);
+#endif
 #if LATTICE
   draw_lattice(to, nodes, h, perspective, first, m, n, item);
 #else
@@ -52,7 +62,7 @@ inline int spread_tile(int k, int count) {
   return (int)((ulong)k * step % count);
 }
 
-__kernel void tile_patches(__global const float *view, __global const short4 *boxes /* bins */,
+__kernel void tile_patches(__global const float *view, __global const short *boxes /* bins */, int stride,
                            __global const float *records, __global const int *sizes, __global const uint *offsets,
                            int count, __global const float *steps, __global const ushort *rims,
                            __global const uint4 *all_nodes, __global const float *twists, int surface, int tiles_x,
@@ -82,7 +92,7 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
   to.cost = cost;
   int4 whole = (int4)(to.x, to.y, (to.x + TILE < width ? to.x + TILE : width) - 1,
                       (to.y + TILE < height ? to.y + TILE : height) - 1);
-#define MISSES(b) (b.x > bin_x + TILE_BINS - 1 || b.z < bin_x || b.y > bin_y + TILE_BINS - 1 || b.w < bin_y)
+#define BOX(k) (int4)(boxes[k], boxes[stride + (k)], boxes[2 * stride + (k)], boxes[3 * stride + (k)])
 #define CLIPPED_TO(b) (int4)(max(whole.x, b.x * BIN), max(whole.y, b.y * BIN), min(whole.z, b.z * BIN + BIN - 1), \
                              min(whole.w, b.w * BIN + BIN - 1))
 #if VW == 1
@@ -92,8 +102,8 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
   SYNC;
   for (to.round = 0; to.round < ROUNDS; to.round++) {
     for (int k = 0; k < count; k++) {
-      short4 b = boxes[k];
-      if (MISSES(b)) continue;
+      int4 b = BOX(k);
+      if (b.x > bin_x + TILE_BINS - 1 || b.z < bin_x || b.y > bin_y + TILE_BINS - 1 || b.w < bin_y) continue;
       any = 1;
       draw_hit(&to, patches, nodes, k, CLIPPED_TO(b), item);
     }
@@ -102,10 +112,12 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
 #else
   for (int k = 0; k < count;) {
     int hits[HITS], sorted[HITS], found = 0, starts[CLASSES + 1];
-    for (; k < count && found < HITS; k++) {
-      short4 b = boxes[k];
-      hits[found] = k;
-      found += !MISSES(b);
+    for (; k < count && found <= HITS - VW; k += VW) {
+      VI touched_here = ((VI)(k) + LANE_INDEX < count) & (BOXES_AT(k) < bin_x + TILE_BINS)
+                      & (BOXES_AT(stride + k) < bin_y + TILE_BINS) & (BOXES_AT(2 * stride + k) >= bin_x)
+                      & (BOXES_AT(3 * stride + k) >= bin_y);
+      if (any_lane(touched_here))
+        for (uint bits = lane_mask(touched_here); bits; bits &= bits - 1) hits[found++] = k + FIRST_LANE(bits);
     }
     if (!found) continue;
     if (!any) {
@@ -131,9 +143,9 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
     for (int i = 0; i < TILE_BINS * TILE_BINS; i++) { farthest[i] = NO_SAMPLE; stale[i] = 0; }
     for (int i = 0; i < found; i++) {
       int p = sorted[i];
-      short4 b = boxes[p];
-      int x0 = max((int)b.x, bin_x) - bin_x, x1 = min((int)b.z, bin_x + TILE_BINS - 1) - bin_x;
-      int y0 = max((int)b.y, bin_y) - bin_y, y1 = min((int)b.w, bin_y + TILE_BINS - 1) - bin_y;
+      int4 b = BOX(p);
+      int x0 = max(b.x, bin_x) - bin_x, x1 = min(b.z, bin_x + TILE_BINS - 1) - bin_x;
+      int y0 = max(b.y, bin_y) - bin_y, y1 = min(b.w, bin_y + TILE_BINS - 1) - bin_y;
       float layer = (records[(size_t)p * PATCH_STRIDE + PATCH_NEAR] - view[FIRST_DEPTH]) * view[LAYER] - 2.0f;
       layer = layer < 0.0f ? 0.0f : layer > LAST_LAYER ? LAST_LAYER : layer;
       uint key = (uint)layer << 12;
@@ -174,34 +186,38 @@ __kernel void tile_patches(__global const float *view, __global const short4 *bo
   // Strips of VW pixels, as many rows as blocks of 4 pixels have: blocks are resolved, rows are shaded.
   for (int y = to.y; y <= whole.w; y += VW / 4)
     for (int x = to.x; x <= whole.z; x += VW) {
-      Shown rows[VW / 4];
+      Shown blocks[VW / 4];
       int some = 0;
       for (int b = 0; b < VW / 4; b++) {
-        if (x + 4 * b >= to.x + TILE) break;
-        VU payload = payload_of(&to, SLOT_OF(x - to.x + 4 * b, y - to.y));
-        VF px = TO_VF((VI)(x + 4 * b) + (LANE_INDEX & 3)) + 0.5f, py = TO_VF((VI)(y) + (LANE_INDEX >> 2)) + 0.5f;
-        Shown s = resolve(view, patches, nodes, payload, px, py);
-        s.id = surface;
+        int block = x + 4 * b < to.x + TILE ? x + 4 * b : x;  // past the tile's edge: anything
+        VU payload = payload_of(&to, SLOT_OF(block - to.x, y - to.y));
+        VF px = TO_VF((VI)(block) + (LANE_INDEX & 3)) + 0.5f, py = TO_VF((VI)(y) + (LANE_INDEX >> 2)) + 0.5f;
+        blocks[b] = resolve(view, patches, nodes, payload, px, py);
         some |= any_lane(payload != (VU)(NO_SAMPLE));
-#define PIECES(f) for (int r = 0; r < VW / 4; r++) ((float4 *)&rows[r].f)[b] = ((float4 *)&s.f)[r];
-        PIECES(depth) PIECES(nx) PIECES(ny) PIECES(nz)
-#if FIELD_COLOR >= 0
-        PIECES(red) PIECES(green) PIECES(blue)
-#endif
-#if FIELD_ID >= 0
-        PIECES(id)
-#endif
-#if FIELD_COUNT >= 0
-        PIECES(count)
-#endif
-#if FIELD_LEVEL >= 0
-        PIECES(level)
-#endif
       }
       int lanes = whole.z + 1 - x < VW ? whole.z + 1 - x : VW;
       for (int r = 0; r < VW / 4 && y + r <= whole.w; r++) {
-        if (some) shade_row(frame, shading, &rows[r], width, x, y + r, lanes, out);
-        else background_row(shading, width, x, y + r, lanes, out);
+        if (some) {
+          Shown row;
+          row.id = surface;
+#if VW == 16
+#define PIECE(f, type, b) ((const type *)&blocks[b].f)[r]
+#define ROW_OF(f, vector, type) row.f = (vector)(PIECE(f, type, 0), PIECE(f, type, 1), PIECE(f, type, 2), PIECE(f, type, 3));
+#else
+#define ROW_OF(f, vector, type) for (int b = 0; b < VW / 4; b++) ((type *)&row.f)[b] = ((const type *)&blocks[b].f)[r];
+#endif
+          ROW_OF(depth, VF, float4) ROW_OF(nx, VF, float4) ROW_OF(ny, VF, float4) ROW_OF(nz, VF, float4)
+#if FIELD_COLOR >= 0
+          ROW_OF(red, VF, float4) ROW_OF(green, VF, float4) ROW_OF(blue, VF, float4)
+#endif
+#if FIELD_COUNT >= 0
+          ROW_OF(count, VI, int4)
+#endif
+#if FIELD_LEVEL >= 0
+          ROW_OF(level, VI, int4)
+#endif
+          shade_row(frame, shading, &row, width, x, y + r, lanes, out);
+        } else background_row(shading, width, x, y + r, lanes, out);
 #if WRITE_COST
         for (int i = 0; i < lanes; i++)
           cost_out[(size_t)(y + r) * width + x + i] = cost[(y + r - to.y) / BIN * TILE_BINS + (x + i - to.x) / BIN];
