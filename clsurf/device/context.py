@@ -178,6 +178,22 @@ class Device:
         del done  # the queue is in order: every launch before the mapping has ended
         return array.host.copy() if copy else array.host
 
+    def download_all(self, arrays: dict[str, DeviceArray]) -> dict[str, np.ndarray]:
+        """Wait for the device once and return the contents by name; see `download` with `copy=False`.
+
+        PoCL takes 50 us for every array that is waited for by itself.
+        """
+        if self.pool is None:
+            return {name: self.download(array, copy=False) for name, array in arrays.items()}
+        mapped = [cl.enqueue_map_buffer(self.queue, array.buffer, cl.map_flags.READ, 0, array.shape, array.dtype,
+                                        is_blocking=False)[0]
+                  for array in arrays.values() if array.nbytes and array.host is not None]
+        self.finish()
+        for array in mapped:
+            array.base.release(self.queue)
+        return {name: self.download(array, copy=False) if array.host is None else array.host
+                for name, array in arrays.items()}
+
     def trim(self) -> None:
         """Give the memory kept for reuse back to the system."""
         if self.pool is not None:
