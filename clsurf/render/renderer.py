@@ -13,6 +13,8 @@ from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
+from .mirror import CHANNELS as MIRROR_CHANNELS
+from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
@@ -124,6 +126,8 @@ class Renderer:
         shading = DEFAULT_SHADING if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
         if not isinstance(shading, Shading):
             raise InputError(f"shading: expected a clsurf.Shading or the name of a look, got {shading!r}")
+        if wants_mirror(shading, channels):
+            channels = list(dict.fromkeys([*channels, *MIRROR_CHANNELS]))
         patches = DEFAULT_PATCHES if patches is None else patches
         if not isinstance(patches, PatchDrawing):
             raise InputError(f"patches: expected a clsurf.PatchDrawing, got {patches!r}")
@@ -156,6 +160,8 @@ class Renderer:
                     light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
                                shading.look, channels)
+            if wants_mirror(shading, channels):
+                reflect(self.device, scene, camera, shading, floats[8:12], origin, arrays)
             if factor > 1:
                 arrays = average(self.device, arrays, picture, factor, wanted, curved, self._scratch.lanes)
             arrays = self.device.download_all(arrays)
@@ -176,9 +182,10 @@ class Renderer:
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed)
-        lit |= wants_traced_light(shading, channels)
-        layout = Layout(color=(colored or lit) and "color" in channels, id="id" in channels, count="count" in channels,
-                        level="level" in channels, lit=lit, differentials=curved)
+        traced = wants_traced_light(shading, channels)
+        layout = Layout(color=(colored or lit or traced) and "color" in channels, id="id" in channels,
+                        count="count" in channels, level="level" in channels, lit=lit, traced=traced,
+                        differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,

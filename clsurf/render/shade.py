@@ -68,13 +68,16 @@ class Shading:
     stripes : float
         With "reflection": dark lines on a sphere.
     shadows : bool
-        With "phong": the scene's lights throw hard shadows, but for a headlight, which has none. SLIM surfaces throw
-        them; all surfaces receive them.
+        With "phong": the scene's lights throw hard shadows, but for a headlight, which has none. All surfaces throw
+        and receive them (patches that `PatchDrawing` lights at their nodes receive none).
     occlusion : int
         With "phong": directions above a surface along which ambient occlusion looks for SLIM surfaces (32 to 256); the
         part of them that is open multiplies `ambient`, so give that more weight. 0: none.
     occlusion_reach : float, optional
         How far ambient occlusion looks, world units; by default a quarter of the scene's diagonal.
+    mirror : float or sequence of float
+        With "phong": the share, 0 to 1, of mirror reflection (one bounce) in the colour of all surfaces, or of each
+        surface of the scene in turn.
     """
 
     look: str = "phong"
@@ -89,6 +92,7 @@ class Shading:
     shadows: bool = False
     occlusion: int = 0
     occlusion_reach: float | None = None
+    mirror: float | tuple[float, ...] = 0.0
 
     def __post_init__(self):
         if self.look not in LOOKS:
@@ -105,6 +109,10 @@ class Shading:
                              f"{self.occlusion!r}")
         if self.occlusion_reach is not None:
             _checked_numbers("occlusion_reach", self.occlusion_reach, 0)
+        shares = np.asarray(self.mirror)
+        if shares.ndim > 1 or shares.dtype.kind not in "fiu" or not ((shares >= 0) & (shares <= 1)).all():
+            raise InputError("shading mirror: expected a share from 0 to 1, or one for each surface, got "
+                             f"{self.mirror!r}")
 
 
 def _checked_numbers(name, value, count) -> None:

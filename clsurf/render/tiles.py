@@ -26,7 +26,8 @@ class Layout:
     id: bool = False
     count: bool = False
     level: bool = False
-    lit: bool = False  # some colours are lit already
+    lit: bool = False  # colours of patches are lit at their nodes
+    traced: bool = False  # colours are lit before the last stage, where rays decide over the light
     differentials: tuple[str, ...] = ()  # channels of curvature, in the order of their planes
 
     @property
@@ -45,7 +46,7 @@ class Layout:
         if self.differentials:
             out |= field_constants(self.differentials, at)
             at += self.differential_planes
-        return out | {"FIELDS": at, "LIT_COLORS": self.lit}
+        return out | {"FIELDS": at, "LIT_COLORS": self.lit or self.traced}
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,10 +110,10 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
     device.check_memory(surfels=4 * planes.size + tails.nbytes, nodes=4 * 16 * 16 * tree.node_count)
     points = centers[at]
     center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+    boxes, balls = node_boxes(tree, below, above), node_boxes(tree, centers - reach, centers + reach)
+    cones = node_cones(tree, surface.normals, np.arctan(np.where(usable, slope, 0)))
     return TracedSlim(
-        degree, surface.oriented, tree, device.upload(node_boxes(tree, below, above)),
-        device.upload(node_boxes(tree, centers - reach, centers + reach)),
-        device.upload(node_cones(tree, surface.normals, np.arctan(np.where(usable, slope, 0)))),
+        degree, surface.oriented, tree, device.upload(boxes), device.upload(balls), device.upload(cones),
         device.upload(planes.reshape(-1, WIDTH, SURFEL_FLOATS).transpose(0, 2, 1).astype(np.float32)),
         device.upload(tails), None if colors is None else device.upload(colors), surface.origin, center,
         float((np.linalg.norm(points - center, axis=1) + radii[at]).max()) if len(points) else 0.0)
