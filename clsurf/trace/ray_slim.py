@@ -1,12 +1,13 @@
 """SLIM surfaces for single rays: leaves in blocks of 16, one lane each. Kernel: kernels/trace/ray_slim.cl."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..device import Device
 from ..surface.slim import COEFFICIENTS, SlimSurface
 from .kinds import NOTHING, Traced, items, register
-from .slim import upload_traced
-from .tree import WIDTH
+from .slim import kept_traced
+from .tree import EMPTY, WIDTH, Tree
 
 FAR = 1e15  # where the ball of an empty slot lies
 
@@ -14,7 +15,7 @@ FAR = 1e15  # where the ball of an empty slot lies
 @register(SlimSurface)
 def trace_slim(device: Device, surface: SlimSurface) -> Traced:
     """Put the leaves on the device; the frame is the model's, relative to its origin."""
-    base = upload_traced(device, surface)
+    base = kept_traced(device, surface)
     tree, count = base.tree, COEFFICIENTS[surface.degree]
     if not (tree.order >= 0).any():
         return Traced(surface.origin, 1.0, NOTHING, lambda *_: None)
@@ -33,12 +34,62 @@ def trace_slim(device: Device, surface: SlimSurface) -> Traced:
     margin = 1e-3 * float((box[1] - box[0]).max())
     leaves = np.flatnonzero(surface.leaf) if surface.leaf.any() else np.arange(len(surface))  # what the tree holds
     numbers = np.where(tree.order >= 0, leaves[tree.order], -1).astype(np.int32)
-    arrays = [device.upload(array) for array in (blocks, feet, limited, numbers)]
+    lists = neighbour_lists(tree, device.download(base.boxes), device.download(base.balls))
+    arrays = [device.upload(array) for array in (blocks, feet, limited, numbers, *lists)]
 
     def launch(mode, rays_count, rays, hits):
         size, group, batch = items(device, rays_count)
         constants = {"VW": device.lanes, "DEGREE": surface.degree, "ORIENTED": surface.oriented, "MODE": mode}
         device.kernel("trace/ray_slim.cl", constants=constants)(
-            size, group, rays_count, batch, tree.roots, tree.first_bottom, base.boxes, base.balls, *arrays, rays, hits)
+            size, group, rays_count, batch, tree.roots, tree.first_bottom, base.boxes, *arrays, rays, hits)
 
     return Traced(surface.origin, 1.0, box + margin * np.array([[-1.0], [1.0]]), launch)
+
+
+def neighbour_lists(tree: Tree, boxes: NDArray, balls: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return for each bottom node those whose balls reach into its piece of surface.
+
+    A point's blend asks the boxes of its own bottom node's list, 1.2 vectors of 16 on the dragon, where a walk from the
+    top took 3 nodes one after the other (4.4 against 4.7 Mrays/s).
+
+    Parameters
+    ----------
+    boxes, balls : (nodes, 6, 16) float32
+        Of a tree's pieces of surface, and of its whole balls.
+
+    Returns
+    -------
+    first : (bottom nodes + 1,) int32
+        The groups of bottom node i are first[i] to first[i + 1] - 1.
+    near_boxes : (groups, 6, 16) float32
+        Boxes of balls, `EMPTY` where a group has fewer than 16.
+    near_nodes : (groups, 16) int32
+        Bottom nodes, counted from 0.
+    """
+    pieces, whole = boxes[tree.first_bottom:], balls[tree.first_bottom:]
+    low, high = pieces[:, :3].min(axis=2), pieces[:, 3:].max(axis=2)
+    parts = [_pairs(tree, balls, low, high, start) for start in range(0, len(pieces), 4096)]
+    bottom, near = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    count = np.bincount(bottom, minlength=len(pieces))
+    first = np.concatenate([[0], np.cumsum(-(-count // WIDTH))]).astype(np.int32)
+    place = np.arange(len(near)) - (np.cumsum(count) - count)[bottom]
+    group, lane = first[bottom] + place // WIDTH, place % WIDTH
+    near_boxes = np.empty((max(int(first[-1]), 1), 6, WIDTH), np.float32)
+    near_boxes[:, :3], near_boxes[:, 3:] = EMPTY, -EMPTY
+    near_boxes[group, :3, lane], near_boxes[group, 3:, lane] = whole[near, :3].min(axis=2), whole[near, 3:].max(axis=2)
+    near_nodes = np.zeros((len(near_boxes), WIDTH), np.int32)
+    near_nodes[group, lane] = near
+    return first, near_boxes, near_nodes
+
+
+def _pairs(tree: Tree, balls: NDArray, low: NDArray, high: NDArray, start: int) -> tuple[NDArray, NDArray]:
+    """Return pairs (bottom node, one whose balls reach into its box) for 4096 bottom nodes from `start` on."""
+    bottom = np.arange(start, min(start + 4096, len(low)))
+    node = np.zeros(len(bottom), np.int64)
+    while len(node) and node[0] < tree.first_bottom:
+        meets = (balls[node, :3] <= high[bottom][:, :, None]) & (balls[node, 3:] >= low[bottom][:, :, None])
+        row, child = np.nonzero(meets.all(axis=1))
+        first = np.where(node == 0, 1, WIDTH * node + tree.roots - (WIDTH - 1))
+        bottom, node = bottom[row], first[row] + child
+    order = np.lexsort((node, bottom))
+    return bottom[order], node[order] - tree.first_bottom

@@ -1,9 +1,12 @@
 // Single rays against a SLIM surface, by the rules of the tile renderer (kernels/render/tile_slim.cl): the frontmost hit
 // of the balls shrunk by ALPHA, then the blend of all surfels whose ball holds that point; where its weights add up to
 // less than SUPPORT, the ray looks behind it, up to TRIES times, and keeps the last hit. One work-item traces `batch`
-// rays, one after the other. Twin: tests/reference/trace_rays.py, ray_slim.
+// rays: with 16 lanes in turns (ray_batch.clh), otherwise one after the other. Twin: tests/reference/trace_rays.py,
+// ray_slim.
 //
-// A bottom node has a block of FIELDS vectors of 16 floats, one lane for each slot (clsurf/trace/ray_slim.py).
+// A bottom node has a block of FIELDS vectors of 16 floats, one lane for each slot, and a list of the bottom nodes whose
+// balls reach into its piece of surface: groups near_first[bottom] to near_first[bottom + 1] - 1, each 16 boxes of balls
+// as a node has them, and the 16 bottom nodes (clsurf/trace/ray_slim.py).
 #include "common/slim.clh"
 #include "trace/ray_walk.clh"
 
@@ -101,14 +104,22 @@ INLINE VI inside_footprint(VU lo, VU hi, VF u, VF v) {
        & (-u <= SIDE_OF(hi, 0)) & (-a <= SIDE_OF(hi, 8)) & (-v <= SIDE_OF(hi, 16)) & (-b <= SIDE_OF(hi, 24));
 }
 
-typedef struct { float key, t, side; int slot; } Front;
+typedef struct { float low, low_front, low_back; } Goal;  // hits of either side are looked for behind these
+typedef struct { float key, t, side; int slot; } Found;
+typedef struct {
+  __global const float *blocks;
+  __global const uint *feet;     // footprints: 2 words a slot, as 2 vectors of 16
+  __global const uchar *limited; // whether any slot of a bottom node has one
+} Model;
 
-// Take the frontmost hit of the surfels of one bottom node where it is nearer than found->key. A hit from the front lies
-// behind `low`, one from the back behind `low_back`.
-INLINE void block_hit(const Ray *r, __global const float *block, __global const uint *feet, int limited, float low,
-                      float low_back, int slot, Front *found) {
-  for (int part = 0; part < WIDE / VW; part++, slot += VW) {
-    __global const float *k = block + part * VW;
+INLINE __global const float *block_of(__global const float *blocks, int bottom) {
+  return blocks + (size_t)bottom * (FIELDS * WIDE);
+}
+
+// Take the frontmost hit of the surfels of a bottom node where it is nearer than found->key.
+INLINE void leaf_hit(const Ray *r, const Goal *goal, Model m, int bottom, Found *found) {
+  for (int part = 0; part < WIDE; part += VW) {
+    __global const float *k = block_of(m.blocks, bottom) + part;
     VF x = r->ox - FIELD(AT_X), y = r->oy - FIELD(AT_Y), z = r->oz - FIELD(AT_Z);
     // From the point next to the centre, where nothing cancels.
     VF t = -(x * r->dx + y * r->dy + z * r->dz), shrink = FIELD(SHRINK);
@@ -121,65 +132,62 @@ INLINE void block_hit(const Ray *r, __global const float *block, __global const 
     Spot p1 = moved(p, s1, d), p2 = moved(p, s2, d);
     s1 = t + s1 * FIELD(SIZE); s2 = t + s2 * FIELD(SIZE);
     VF k1 = s1, k2 = ORIENTED ? s2 + BACK_BIAS * FIELD(SIZE) : s2;
-    front = front & (length2(p1) < ALPHA * ALPHA) & (s1 > low) & (s1 < r->far) & (k1 < found->key);
-    back = back & (length2(p2) < ALPHA * ALPHA) & (s2 > low_back) & (s2 < r->far) & (k2 < found->key);
+    front = front & (length2(p1) < ALPHA * ALPHA) & (s1 > goal->low_front) & (s1 < r->far) & (k1 < found->key);
+    back = back & (length2(p2) < ALPHA * ALPHA) & (s2 > goal->low_back) & (s2 < r->far) & (k2 < found->key);
     if (!any_lane(front | back)) continue;
-    if (limited) {
-      VU lo = *(__global const VU *)(feet + part * VW), hi = *(__global const VU *)(feet + WIDE + part * VW);
+    if (m.limited[bottom]) {
+      __global const uint *feet = m.feet + (size_t)bottom * (2 * WIDE) + part;
+      VU lo = *(__global const VU *)feet, hi = *(__global const VU *)(feet + WIDE);
       VI free = (lo & hi) == 0xffffffffu;
       front = front & (free | inside_footprint(lo, hi, p1.u, p1.v));
       back = back & (free | inside_footprint(lo, hi, p2.u, p2.v));
     }
     k1 = SEL((VF)(INFINITY), k1, front); k2 = SEL((VF)(INFINITY), k2, back);
     VI behind = k2 < k1;
-    VF key = SEL(k1, k2, behind), root = SEL(s1, s2, behind);
-    VF side = SEL((VF)(1.0f), (VF)(-1.0f), behind);
+    VF key = SEL(k1, k2, behind), at = SEL(s1, s2, behind), side = SEL((VF)(1.0f), (VF)(-1.0f), behind);
     float least = lane_min(key);
     if (least < found->key) {
       int lane = FIRST_BIT(bits_of(key == least));
-      found->key = least; found->t = LANE_OF(root, lane); found->side = LANE_OF(side, lane); found->slot = slot + lane;
+      found->key = least; found->t = LANE_OF(at, lane); found->side = LANE_OF(side, lane);
+      found->slot = bottom * WIDE + part + lane;
     }
   }
 }
 
-INLINE Front frontmost(const Ray *r, int roots, int first_bottom, __global const float *boxes,
-                       __global const float *blocks, __global const uint *feet, __global const uchar *limited,
-                       float low, float low_front, float low_back) {
-  Front found;
-  found.key = INFINITY; found.t = INFINITY; found.side = 0.0f; found.slot = -1;
-  Waiting w;
-  float enters[WIDE] __attribute__((aligned(64)));
-  w.node[0] = 0; w.enters[0] = low; w.count = 1;
-  while (w.count > 0) {
-    w.count--;
-    if (w.enters[w.count] >= found.key) continue;
-    int node = w.node[w.count];
-    if (node < first_bottom) {
-      float most = found.key < r->far ? found.key : r->far;
-      uint bits = children_along(r, boxes + (size_t)node * BOX_FLOATS, low, most, enters);
-      push_children(&w, bits, enters, first_child(node, roots));
-    } else {
-      int bottom = node - first_bottom;
-      block_hit(r, blocks + (size_t)bottom * (FIELDS * WIDE), feet + (size_t)bottom * (2 * WIDE), limited[bottom],
-                low_front, low_back, bottom * WIDE, &found);
-      if (MODE == ANY && found.slot >= 0) w.count = 0;
-    }
-  }
-  return found;
+INLINE Found nothing_found() {
+  Found f;
+  f.key = INFINITY; f.t = INFINITY; f.side = 0.0f; f.slot = -1;
+  return f;
 }
 
 typedef struct { VF weight, step, x, y, z, last; } Blend;
 
-// Add the surfels of a bottom node whose ball holds the point q of the ray.
-INLINE void block_blend(const Ray *r, __global const float *block, float qx, float qy, float qz, float facing,
+INLINE Blend no_blend() {
+  Blend sum;
+  sum.weight = sum.step = sum.x = sum.y = sum.z = sum.last = 0.0f;
+  return sum;
+}
+
+// Whether the ball of any surfel of a bottom node holds the point q.
+INLINE int holds(__global const float *block, const float *q) {
+  int any = 0;
+  for (int part = 0; part < WIDE; part += VW) {
+    __global const float *k = block + part;
+    VF x = q[0] - FIELD(AT_X), y = q[1] - FIELD(AT_Y), z = q[2] - FIELD(AT_Z), r = FIELD(SIZE);
+    any |= any_lane(x * x + y * y + z * z < r * r) ? 1 : 0;
+  }
+  return any;
+}
+
+// Add the surfels of a bottom node whose ball holds the point q, which a ray along (dx, dy, dz) hit from `facing`.
+INLINE void block_blend(__global const float *block, const float *q, float dx, float dy, float dz, float facing,
                         Blend *sum) {
-  for (int part = 0; part < WIDE / VW; part++) {
-    __global const float *k = block + part * VW;
+  for (int part = 0; part < WIDE; part += VW) {
+    __global const float *k = block + part;
     VF shrink = FIELD(SHRINK);
-    Spot p = turned(k, (qx - FIELD(AT_X)) * shrink, (qy - FIELD(AT_Y)) * shrink, (qz - FIELD(AT_Z)) * shrink);
+    Spot p = turned(k, (q[0] - FIELD(AT_X)) * shrink, (q[1] - FIELD(AT_Y)) * shrink, (q[2] - FIELD(AT_Z)) * shrink);
+    Spot d = turned(k, dx, dy, dz);
     VI inside = length2(p) < 1.0f;
-    if (!any_lane(inside)) continue;
-    Spot d = turned(k, r->dx, r->dy, r->dz);
     RayPoly f = poly_at(k, p, d);
     VF step, slope, gu, gv;
 #if ORIENTED
@@ -210,76 +218,204 @@ INLINE void block_blend(const Ray *r, __global const float *block, float qx, flo
   }
 }
 
-INLINE Blend blended(const Ray *r, int roots, int first_bottom, __global const float *balls,
-                     __global const float *blocks, Front hit) {
-  Blend sum;
-  sum.weight = sum.step = sum.x = sum.y = sum.z = sum.last = 0.0f;
-  float x = r->ox + hit.t * r->dx, y = r->oy + hit.t * r->dy, z = r->oz + hit.t * r->dz;
-  int stack[STACK], count = 1;
-  stack[0] = 0;
-  while (count > 0) {
-    int node = stack[--count];
-    if (node < first_bottom) {
-      uint bits = children_around(balls + (size_t)node * BOX_FLOATS, x, y, z);
-      int first = first_child(node, roots);
-      while (bits) {
-        stack[count++] = first + FIRST_BIT(bits);
-        bits &= bits - 1u;
-      }
-    } else
-      block_blend(r, blocks + (size_t)(node - first_bottom) * (FIELDS * WIDE), x, y, z, hit.side, &sum);
+INLINE float of_slot(__global const float *blocks, int slot, int field) {
+  return block_of(blocks, slot / WIDE)[field * WIDE + slot % WIDE];
+}
+
+INLINE Goal goal_of(__global const float *ray, __global const float *out) {
+  Goal g;
+  g.low = g.low_front = g.low_back = ray[3];
+#if MODE == NEXT
+  // A hit from the same side less than a radius behind the last one is of the same sheet.
+  float low = out[HIT_LOW] > g.low ? out[HIT_LOW] : g.low, sheet = out[HIT_STATE] > low ? out[HIT_STATE] : low;
+  g.low = low;
+  g.low_front = out[HIT_SIDE] > 0.0f ? sheet : low;
+  g.low_back = out[HIT_SIDE] < 0.0f ? sheet : low;
+#endif
+  return g;
+}
+
+INLINE void look_behind(Goal *g, float t) {
+  g->low = t;
+  g->low_front = g->low_front > t ? g->low_front : t;
+  g->low_back = g->low_back > t ? g->low_back : t;
+}
+
+INLINE void store_miss(__global float *out) {
+  for (int i = 0; i < HIT_FLOATS; i++) out[i] = 0.0f;
+  out[HIT_T] = INFINITY;
+  out[HIT_PRIMITIVE] = as_float(-1);
+}
+
+// What a hit is without blending.
+INLINE void store_any(__global float *out, Found hit, __global const float *blocks, __global const int *order) {
+  if (hit.slot < 0) return;
+  out[HIT_T] = hit.t; out[HIT_SIDE] = hit.side; out[HIT_PRIMITIVE] = as_float(order[hit.slot]);
+  for (int i = 0; i < 3; i++) out[HIT_NORMAL + i] = hit.side * of_slot(blocks, hit.slot, N_X + i);
+}
+
+// Returns the weight that the hit is supported by.
+INLINE float store_blend(__global float *out, Found hit, const Blend *sum, __global const float *blocks,
+                         __global const int *order) {
+  float weight = lane_sum(sum->weight);
+  if (!(weight > 0.0f)) return SUPPORT;
+  out[HIT_T] = hit.t + lane_sum(sum->step) / weight;
+  out[HIT_NORMAL] = lane_sum(sum->x); out[HIT_NORMAL + 1] = lane_sum(sum->y); out[HIT_NORMAL + 2] = lane_sum(sum->z);
+  out[HIT_PRIMITIVE] = as_float(order[hit.slot]);
+  out[HIT_SIDE] = hit.side;
+#if MODE == NEXT
+  out[HIT_LOW] = hit.t - lane_min(-sum->last);
+  out[HIT_STATE] = hit.t + of_slot(blocks, hit.slot, SIZE);
+#endif
+  return weight;
+}
+
+INLINE void hit_point(__global const float *ray, float t, float *q) {
+  for (int i = 0; i < 3; i++) q[i] = ray[i] + t * ray[4 + i];
+}
+
+INLINE Blend blended(__global const float *ray, Found hit, __global const float *blocks,
+                     __global const int *near_first, __global const float *near_boxes, __global const int *near_nodes) {
+  Blend sum = no_blend();
+  int bottom = hit.slot / WIDE;
+  float q[3];
+  hit_point(ray, hit.t, q);
+  for (int g = near_first[bottom]; g < near_first[bottom + 1]; g++) {
+    uint bits = children_around(near_boxes + (size_t)g * BOX_FLOATS, q[0], q[1], q[2]);
+    while (bits) {
+      __global const float *block = block_of(blocks, near_nodes[g * WIDE + FIRST_BIT(bits)]);
+      bits &= bits - 1u;
+      if (holds(block, q)) block_blend(block, q, ray[4], ray[5], ray[6], hit.side, &sum);
+    }
   }
   return sum;
 }
 
-INLINE float of_slot(__global const float *blocks, int slot, int field) {
-  return blocks[(size_t)(slot / WIDE) * (FIELDS * WIDE) + field * WIDE + slot % WIDE];
-}
+#if VW != 16
+#include "trace/ray_one.clh"
+#else
+#include "trace/ray_batch.clh"
+#define PAIRS 1024
 
-__kernel void ray_slim(int count, int batch, int roots, int first_bottom, __global const float *boxes,
-                       __global const float *balls, __global const float *blocks, __global const uint *feet,
-                       __global const uchar *limited, __global const int *order, __global const float *rays,
+// Blend the hits of `todo` rays; those with too little support stay in it. Returns how many.
+INLINE int blend_batch(Walks *w, uchar *todo, int left, __global const float *blocks, __global const int *near_first,
+                       __global const float *near_boxes, __global const int *near_nodes, __global const int *order,
+                       __global const float *rays, __global float *hits) {
+  int pairs[PAIRS], first_pair[BATCH + 1], again = 0;
+  float points[BATCH][3];
+  uchar at[BATCH];
+  for (int start = 0; start < left;) {
+    // Ask first which bottom nodes matter to which hit, so that the blending itself runs without branches.
+    int pair_count = 0, count = 0;
+    for (; start < left; start++) {
+      int q = todo[start];
+      Found hit = w->found[q];
+      if (hit.slot < 0) continue;
+      int bottom = hit.slot / WIDE, first = near_first[bottom], end = near_first[bottom + 1];
+      if (pair_count + (end - first) * WIDE > PAIRS) {
+        if (pair_count) break;
+        Blend sum = blended(rays + q * RAY_FLOATS, hit, blocks, near_first, near_boxes, near_nodes);
+        float weight = store_blend(hits + q * HIT_FLOATS, hit, &sum, blocks, order);
+        look_behind(&w->goal[q], hit.t);
+        todo[again] = q; again += weight < SUPPORT;
+        continue;
+      }
+      float *point = points[count];
+      hit_point(rays + q * RAY_FLOATS, hit.t, point);
+      first_pair[count] = pair_count;
+      for (int g = first; g < end; g++) {
+        uint bits = children_around(near_boxes + (size_t)g * BOX_FLOATS, point[0], point[1], point[2]);
+        while (bits) {
+          pairs[pair_count++] = near_nodes[g * WIDE + FIRST_BIT(bits)];
+          bits &= bits - 1u;
+        }
+      }
+      at[count++] = q;
+    }
+    first_pair[count] = pair_count;
+    int kept = 0;
+    for (int h = 0, e = 0; h < count; h++) {
+      first_pair[h] = kept;
+      for (; e < first_pair[h + 1]; e++) {
+        pairs[kept] = pairs[e];
+        kept += holds(block_of(blocks, pairs[e]), points[h]);
+      }
+    }
+    first_pair[count] = kept;
+    for (int h = 0; h < count; h++) {
+      int q = at[h];
+      Found hit = w->found[q];
+      __global const float *ray = rays + q * RAY_FLOATS;
+      Blend sum = no_blend();
+      for (int e = first_pair[h]; e < first_pair[h + 1]; e++)
+        block_blend(block_of(blocks, pairs[e]), points[h], ray[4], ray[5], ray[6], hit.side, &sum);
+      float weight = store_blend(hits + q * HIT_FLOATS, hit, &sum, blocks, order);
+      look_behind(&w->goal[q], hit.t);
+      todo[again] = q; again += weight < SUPPORT;
+    }
+  }
+  return again;
+}
+#endif
+
+__kernel void ray_slim(int count, int batch /* with 16 lanes at most BATCH */, int roots, int first_bottom,
+                       __global const float *boxes, __global const float *blocks, __global const uint *feet,
+                       __global const uchar *limited, __global const int *order, __global const int *near_first,
+                       __global const float *near_boxes, __global const int *near_nodes, __global const float *rays,
                        __global float *hits) {
   int begin = get_global_id(0) * batch, end = begin + batch < count ? begin + batch : count;
-  for (int i = begin; i < end; i++) {
-    Ray r = load_ray(rays + (size_t)i * RAY_FLOATS);
-    __global float *out = hits + (size_t)i * HIT_FLOATS;
-    float low = r.low, low_front = r.low, low_back = r.low;
-#if MODE == NEXT
-    if (out[HIT_T] == INFINITY) continue;
-    // A hit from the same side less than a radius behind the last one is of the same sheet.
-    low = out[HIT_LOW] > low ? out[HIT_LOW] : low;
-    low_front = out[HIT_SIDE] > 0.0f && out[HIT_STATE] > low ? out[HIT_STATE] : low;
-    low_back = out[HIT_SIDE] < 0.0f && out[HIT_STATE] > low ? out[HIT_STATE] : low;
-#endif
-    float t = INFINITY, x = 0.0f, y = 0.0f, z = 0.0f, side = 0.0f, last = 0.0f, state = 0.0f;
-    int slot = -1;
-    for (int attempt = 0; attempt < TRIES; attempt++) {
-      Front hit = frontmost(&r, roots, first_bottom, boxes, blocks, feet, limited, low, low_front, low_back);
-      if (hit.slot < 0) break;
+  if (begin >= count) return;
+  Model model = {blocks, feet, limited};
+  rays += (size_t)begin * RAY_FLOATS;
+  hits += (size_t)begin * HIT_FLOATS;
+#if VW == 16
+  Walks w;
+  uchar todo[BATCH], active[BATCH];
+  int left = 0;
+  for (int q = 0; q < end - begin; q++) {
+    __global float *out = hits + q * HIT_FLOATS;
+    w.goal[q] = goal_of(rays + q * RAY_FLOATS, out);
+    todo[left] = q; left += !(MODE == NEXT && out[HIT_T] == INFINITY);
+    store_miss(out);
+  }
+  for (int attempt = 0; attempt < TRIES && left; attempt++) {
+    for (int a = 0; a < left; a++) {
+      int q = todo[a];
+      active[a] = q;
+      w.ray[q] = load_ray(rays + q * RAY_FLOATS);
+      w.found[q] = nothing_found();
+    }
+    walk_batch(&w, active, left, roots, first_bottom, boxes, model);
 #if MODE == ANY
-      t = hit.t; side = hit.side; slot = hit.slot;
-      x = side * of_slot(blocks, slot, N_X); y = side * of_slot(blocks, slot, N_Y); z = side * of_slot(blocks, slot, N_Z);
-      break;
+    for (int a = 0; a < left; a++) store_any(hits + todo[a] * HIT_FLOATS, w.found[todo[a]], blocks, order);
+    left = 0;
 #else
-      Blend sum = blended(&r, roots, first_bottom, balls, blocks, hit);
-      float weight = lane_sum(sum.weight);
-      if (!(weight > 0.0f)) break;
-      t = hit.t + lane_sum(sum.step) / weight; side = hit.side; slot = hit.slot;
-      x = lane_sum(sum.x); y = lane_sum(sum.y); z = lane_sum(sum.z);
-#if MODE == NEXT
-      last = hit.t - lane_min(-sum.last);
-      state = hit.t + of_slot(blocks, slot, SIZE);
+    left = blend_batch(&w, todo, left, blocks, near_first, near_boxes, near_nodes, order, rays, hits);
 #endif
-      if (weight >= SUPPORT) break;
-      low = hit.t;
-      low_front = low_front > low ? low_front : low;
-      low_back = low_back > low ? low_back : low;
+  }
+#else
+  for (int q = 0; q < end - begin; q++) {
+    __global const float *ray = rays + q * RAY_FLOATS;
+    __global float *out = hits + q * HIT_FLOATS;
+    Goal goal = goal_of(ray, out);
+    int gone = MODE == NEXT && out[HIT_T] == INFINITY;
+    store_miss(out);
+    if (gone) continue;
+    Ray r = load_ray(ray);
+    float weight = 0.0f;
+    for (int attempt = 0; attempt < TRIES && weight < SUPPORT; attempt++) {
+      Found hit = nothing_found();
+      walk_one(&r, &goal, model, roots, first_bottom, boxes, &hit);
+      weight = SUPPORT;
+      if (hit.slot < 0) continue;
+#if MODE == ANY
+      store_any(out, hit, blocks, order);
+#else
+      Blend sum = blended(ray, hit, blocks, near_first, near_boxes, near_nodes);
+      weight = store_blend(out, hit, &sum, blocks, order);
+      look_behind(&goal, hit.t);
 #endif
     }
-    out[HIT_T] = t;
-    out[HIT_NORMAL] = x; out[HIT_NORMAL + 1] = y; out[HIT_NORMAL + 2] = z;
-    out[HIT_PRIMITIVE] = as_float(slot < 0 ? -1 : order[slot]);
-    out[HIT_SIDE] = side; out[HIT_LOW] = last; out[HIT_STATE] = state;
   }
+#endif
 }
