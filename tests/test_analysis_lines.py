@@ -97,6 +97,15 @@ def test_ridges_of_an_ellipsoid_lie_on_its_symmetry_planes(device):
     assert len(clsurf.lines(frame, "valleys", detail=100, device=device)) == 0
 
 
+def test_lines_do_not_depend_on_the_kernels_form(device, monkeypatch):
+    frame = exact(Torus(), TORUS_CAMERA)
+    one = clsurf.lines(frame, ALL, detail=5, device=device)
+    monkeypatch.setattr(device, "lanes", 1)
+    other = clsurf.lines(frame, ALL, detail=5, device=device)
+    assert len(one) == len(other) > 3 and np.abs(one.points - other.points).max() < 1e-2
+    assert np.abs(one.draw().lines - other.draw().lines).max() < 0.02
+
+
 def test_lines_do_not_depend_on_resolution(device):
     """The same curves at twice the size, at twice the pixels."""
     torus = Torus()

@@ -67,7 +67,7 @@ def test_line_slopes_and_line_links(device, frame, geometry, lanes):
 def test_line_values_smooth_lines_line_edges_line_points(device, frame, geometry, lanes, field, sigma):
     planes = LinePlanes(device, frame, lanes)
     bits = cropped(planes, planes.links)
-    found = planes.field_crossings(field, sigma, 0.05)
+    found = planes.field_crossings(field, sigma, 0.05)()
     values = twin.line_values(bits, geometry[2], frame.channels[field.field], frame.channels[field.strength],
                               field.sign, frame.channels[field.other] if field.other else None,
                               frame.channels[field.axis] if field.axis else None, field.sines)
@@ -96,7 +96,7 @@ def test_line_values_smooth_lines_line_edges_line_points(device, frame, geometry
 @pytest.mark.parametrize("lanes", (16, 8, 1))
 def test_contour_edges_and_line_points(device, frame, geometry, lanes):
     planes = LinePlanes(device, frame, lanes)
-    found = planes.contour_crossings()
+    found = planes.contour_crossings()()
     bits = cropped(planes, planes.links)
     codes = np.zeros((planes.height, planes.columns), np.uint8)
     codes[:, :planes.width] = twin.contour_edges(bits, frame.depth)
@@ -107,7 +107,9 @@ def test_contour_edges_and_line_points(device, frame, geometry, lanes):
     assert np.median(np.abs(found.points - wanted)[:, :2]) < 1e-4 and np.abs(found.points - wanted).max() <= 1
 
 
-def test_draw_strokes_and_blend_strokes(device):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_draw_strokes_and_blend_strokes(device, lanes, monkeypatch):
+    monkeypatch.setattr(device, "lanes", lanes)
     rng = np.random.default_rng(1)
     points = np.concatenate([rng.uniform(-5, 70, (40, 2)), np.full((1, 2), 30.5)]).astype(np.float32)
     strength = rng.uniform(0, 1, len(points)).astype(np.float32)

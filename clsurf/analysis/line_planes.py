@@ -1,6 +1,7 @@
 """The stages of feature lines on the device: from a frame's channels to the points where lines cross pixel edges."""
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,8 +128,11 @@ class LinePlanes:
         self._run("line_links", (self.height, self.stride, self.camera, depths, slope_x, slope_y, links))
         return depths, sine2, links
 
-    def field_crossings(self, field: Field, sigma: float, least: float) -> Crossings:
-        """Smooth a field by a Gaussian of `sigma` pixels; return its zeros where the strength is at least `least`."""
+    def field_crossings(self, field: Field, sigma: float, least: float) -> Callable[[], Crossings]:
+        """Smooth a field by a Gaussian of `sigma` pixels, and find its zeros where the strength is at least `least`.
+
+        The device begins at once; what is returned waits for it, once, and must be called before the next search.
+        """
         axis = bool(field.axis)
         values = self._array("values", 7 if axis else 2)
         unused = self._channel(field.field)
@@ -148,14 +152,16 @@ class LinePlanes:
         self._run("line_edges", (self.width, self.height, self.stride, self.plane, float(least), self.camera,
                                  self.depths, smooth, strength, values, codes),
                   {"AXIS": axis, "EXTREMUM": field.extremum}, padded=False)
-        return self._points(codes, smooth, strength, values, {"AXIS": axis})
+        self.device.queue.flush()
+        return lambda: self._points(codes, smooth, strength, values, {"AXIS": axis})
 
-    def contour_crossings(self) -> Crossings:
-        """Return where the surface seen ends."""
+    def contour_crossings(self) -> Callable[[], Crossings]:
+        """Find where the surface seen ends; as `field_crossings`."""
         codes = self._codes()
         self._run("contour_edges", (self.width, self.height, self.stride, self.links, self.depths, codes),
                   padded=False)
-        return self._points(codes, self.sine2, self.sine2, self.sine2, {"CONTOUR": True})
+        self.device.queue.flush()
+        return lambda: self._points(codes, self.sine2, self.sine2, self.sine2, {"CONTOUR": True})
 
     def _codes(self) -> DeviceArray:
         # Rounded up for lanes that reach beyond the last row's end.

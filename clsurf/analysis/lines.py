@@ -14,7 +14,7 @@ from ..device import open_device
 from ..errors import InputError
 from ..render.frame import Frame
 from .line_chains import Chains, cell_segments, chains, relaxed
-from .line_planes import Field, LinePlanes
+from .line_planes import Crossings, Field, LinePlanes
 from .line_strokes import Lines
 
 # Thresholds in units of the median |H| (squared for suggestive contours), found on bunny, dragon, Max Planck and lion.
@@ -52,6 +52,10 @@ class Limits:
             value = getattr(self, name)
             if not isinstance(value, int | float | np.number) or not low <= value <= high:
                 raise InputError(f"{name}: expected a number from {low:g} to {high:g}, got {value!r}")
+
+    def unit_of(self, field: Field) -> float:
+        """Return the unit of a field's strengths."""
+        return self.unit**field.power / self.detail
 
 
 def line_channels(kinds) -> tuple[str, ...]:
@@ -127,40 +131,43 @@ def lines(frame: Frame, kinds="suggestive_contours", *, silhouette: Frame | None
         if silhouette.size != frame.size:
             raise InputError(f"silhouette: expected the frame's size {frame.size}, got {silhouette.size}")
     device = open_device(device)
-    parts = []
-    planes = LinePlanes(device, frame)
-    for number, kind in enumerate(kinds):
-        if kind != "contours":
-            parts += [(number, part) for part in _field_lines(planes, kind, silhouette, limits)]
-    if "contours" in kinds:  # last: the other frame's planes take the place of this one's
-        outline = planes if silhouette is None else LinePlanes(device, silhouette)
-        parts.append((kinds.index("contours"), _contours(outline, limits)))
+    # Contours, None, last: the silhouette's planes take the place of the frame's.
+    searches = [(number, field) for number, kind in enumerate(kinds) for field in FIELDS.get(kind, ())]
+    searches += [(kinds.index("contours"), None)] if "contours" in kinds else []
+    planes, parts = LinePlanes(device, frame), []
+
+    def begin(field: Field | None):
+        if field is not None:
+            return planes.field_crossings(field, limits.smoothing, field.least * limits.unit_of(field))
+        return (planes if silhouette is None else LinePlanes(device, silhouette)).contour_crossings()
+
+    crossings = begin(searches[0][1])
+    for i, (number, field) in enumerate(searches):
+        found = crossings()
+        if i + 1 < len(searches):  # the device searches while the host joins what it has found
+            crossings = begin(searches[i + 1][1])
+        parts.append((number, _contours(found, silhouette or frame, limits) if field is None else
+                      _field_lines(found, field, frame, silhouette, limits)))
     return _joined(frame, kinds, sorted(parts, key=lambda part: part[0]), unit, device)
 
 
-def _field_lines(planes: LinePlanes, kind, silhouette, limits: Limits) -> list[Chains]:
-    """Return the lines of one kind, their strengths from 0 to 1."""
-    out = []
-    for field in FIELDS[kind]:
-        unit = limits.unit**field.power / limits.detail
-        found = planes.field_crossings(field, limits.smoothing, field.least * unit)
-        if silhouette is not None:
-            found = found.chosen(_shown(silhouette, found.points))
-        pairs = cell_segments(found, contours=False)
-        found.points[:, 3] = np.sqrt(np.clip(found.points[:, 3] / (field.full * unit), 0, 1))
-        joined = chains(found.points, pairs, np.sqrt(field.peak / field.full), limits.length, limits.gap,
-                        GAP_STEEPNESS * footprint(planes.frame), RING)
-        points = relaxed(joined, ROUNDS)
-        out.append(Chains(points, joined.offset, joined.closed))
-    return out
+def _field_lines(found: Crossings, field: Field, frame: Frame, silhouette, limits: Limits) -> Chains:
+    """Return the lines of one field, their strengths from 0 to 1."""
+    if silhouette is not None:
+        found = found.chosen(_shown(silhouette, found.points))
+    pairs = cell_segments(found, contours=False)
+    found.points[:, 3] = np.sqrt(np.clip(found.points[:, 3] / (field.full * limits.unit_of(field)), 0, 1))
+    joined = chains(found.points, pairs, np.sqrt(field.peak / field.full), limits.length, limits.gap,
+                    GAP_STEEPNESS * footprint(frame), RING)
+    return Chains(relaxed(joined, ROUNDS), joined.offset, joined.closed)
 
 
-def _contours(planes: LinePlanes, limits: Limits) -> Chains:
-    found = planes.contour_crossings()
+def _contours(found: Crossings, frame: Frame, limits: Limits) -> Chains:
+    """Return the occluding contours of `frame`."""
     pairs = cell_segments(found, contours=True)
     found.points[:, 3] = 1
     joined = chains(found.points, pairs, 0.0, min(limits.length, CONTOUR_LENGTH), limits.gap,
-                    GAP_STEEPNESS * footprint(planes.frame))
+                    GAP_STEEPNESS * footprint(frame))
     return Chains(relaxed(joined, CONTOUR_ROUNDS), joined.offset, joined.closed)
 
 
