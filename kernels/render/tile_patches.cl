@@ -50,18 +50,6 @@ INLINE void draw_hit(Target *to, Patches patches, Nodes nodes, int k, int4 box, 
 #endif
 }
 
-// Tile number k of `count` in an order that spreads any run of numbers over the picture: PoCL hands out runs, half of what
-// is left at a time, and a model in the upper half kept one of two cores busy (1.3 cores at 500x500).
-inline int spread_tile(int k, int count) {
-  uint step = (uint)(0.618f * count) + 1;
-  for (;; step++) {
-    uint a = step, b = count;
-    while (b) { uint c = a % b; a = b; b = c; }
-    if (a == 1) break;
-  }
-  return (int)((ulong)k * step % count);
-}
-
 __kernel void tile_patches(__global const float *view, __global const short *boxes /* bins */, int stride,
                            __global const float *records, __global const int *sizes, __global const uint *offsets,
                            int count, __global const float *steps, __global const ushort *rims,

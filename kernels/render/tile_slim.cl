@@ -333,6 +333,7 @@ __kernel void tile_slim(__global const float *view, __global const uint2 *pairs,
   int tile = get_global_id(0);
 #endif
   if (tile >= tile_count) return;
+  tile = spread_tile(tile, tile_count);
   int x0 = tile % tiles_x * TILE_BINS, y0 = tile / tiles_x * TILE_BINS;
   for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
     int bin_x = x0 + i % TILE_BINS, bin_y = y0 + i / TILE_BINS;
