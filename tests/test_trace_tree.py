@@ -1,9 +1,9 @@
-"""The wide tree: every primitive once, inside every box and cone above it."""
+"""The wide tree: every primitive once, inside every box above it."""
 
 import numpy as np
 import pytest
 
-from clsurf.trace.tree import EMPTY, WIDTH, node_boxes, node_cones, plant
+from clsurf.trace.tree import EMPTY, WIDTH, node_boxes, plant
 
 COUNTS = (0, 1, 16, 17, 100, 256, 257, 4097)
 
@@ -37,24 +37,18 @@ def test_every_primitive_has_one_slot_on_a_path_of_all_levels(count):
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_boxes_and_cones_hold_all_primitives_below(count):
+def test_boxes_hold_all_primitives_below(count):
     low, high = boxes(count)
-    random = np.random.default_rng(1)
-    normals = random.normal(size=(count, 3)) * 0.3 + [0, 0, 1]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    angles = random.uniform(0, 0.2, count)
     tree = plant(low, high)
-    box, cone = node_boxes(tree, low, high), node_cones(tree, normals, angles)
+    box = node_boxes(tree, low, high)
     for slot, path in paths(tree):
         i = tree.order[slot]
         node, j = path[-1]
         if i < 0:
-            assert (box[node, :3, j] == EMPTY).all() and (box[node, 3:, j] == -EMPTY).all() and cone[node, 3, j] == -2
+            assert (box[node, :3, j] == EMPTY).all() and (box[node, 3:, j] == -EMPTY).all()
             continue
         for node, j in path:
             assert (box[node, :3, j] <= low[i]).all() and (box[node, 3:, j] >= high[i]).all()
-            apart = 2 * np.arcsin(np.linalg.norm(cone[node, :3, j] - normals[i]) / 2) + angles[i]
-            assert cone[node, 3, j] == 2 or np.sin(apart) <= cone[node, 3, j]
 
 
 def test_bottom_nodes_are_full_and_compact():

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..surface.slim import SlimSurface
 from ..surface.slim_bounds import height_bounds, scaled_coefficients
 from ..surface.srgb import LINEAR_OF_BYTE
-from .tree import WIDTH, Tree, node_boxes, node_cones, plant
+from .tree import WIDTH, Tree, node_boxes, plant
 
 ALPHA = 0.8  # hits lie in balls shrunken by this, as in the renderer
 SURFEL_FLOATS = 21  # vectors of 16 of a bottom node; the planes of kernels/common/select_slim.clh
@@ -34,7 +34,6 @@ class TracedSlim:
     tree: Tree
     boxes: DeviceArray  # (nodes, 6, 16) float32: of the pieces of surface in the balls shrunken by ALPHA
     balls: DeviceArray  # (nodes, 6, 16) float32: of the whole balls
-    cones: DeviceArray  # (nodes, 4, 16) float32: of the normals in those pieces
     surfels: DeviceArray  # (bottom nodes, 21, 16) float32
     tails: DeviceArray  # (slots, 16) float32
     colors: DeviceArray | None  # (slots, 4) float32, linear
@@ -107,13 +106,12 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
     if surface.colors is not None:
         colors = np.ones((len(tree.order), 4), np.float32)
         colors[used, :3] = LINEAR_OF_BYTE[surface.colors[at, :3]]
-    device.check_memory(surfels=4 * planes.size + tails.nbytes, nodes=4 * 16 * 16 * tree.node_count)
+    device.check_memory(surfels=4 * planes.size + tails.nbytes, nodes=4 * 12 * WIDTH * tree.node_count)
     points = centers[at]
     center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
     boxes, balls = node_boxes(tree, below, above), node_boxes(tree, centers - reach, centers + reach)
-    cones = node_cones(tree, surface.normals, np.arctan(np.where(usable, slope, 0)))
     return TracedSlim(
-        degree, surface.oriented, tree, device.upload(boxes), device.upload(balls), device.upload(cones),
+        degree, surface.oriented, tree, device.upload(boxes), device.upload(balls),
         device.upload(planes.reshape(-1, WIDTH, SURFEL_FLOATS).transpose(0, 2, 1).astype(np.float32)),
         device.upload(tails), None if colors is None else device.upload(colors), surface.origin, center,
         float((np.linalg.norm(points - center, axis=1) + radii[at]).max()) if len(points) else 0.0)

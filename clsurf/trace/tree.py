@@ -12,8 +12,8 @@ The layout, which the kernels of kernels/trace share (tree.clh):
   does not exist has `EMPTY` for the least and ``-EMPTY`` for the largest coordinate, so that every test that takes the
   face of a box by the sign of its own direction drops it.
 
-One tree may carry several sets of boxes (of a surfel: of its piece of surface, and of its whole ball), and cones of
-normals: all of them come from `node_boxes` and `node_cones` for the same `order`.
+One tree may carry several sets of boxes (of a surfel: of its piece of surface, and of its whole ball): all of them come
+from `node_boxes` for the same `order`.
 """
 
 from dataclasses import dataclass
@@ -140,45 +140,4 @@ def node_boxes(tree: Tree, low: NDArray, high: NDArray) -> NDArray:
         out[nodes, :3] = below.reshape(count, WIDTH, 3).transpose(0, 2, 1)
         out[nodes, 3:] = above.reshape(count, WIDTH, 3).transpose(0, 2, 1)
         below, above = out[nodes, :3].min(axis=2), out[nodes, 3:].max(axis=2)
-    return out
-
-
-def node_cones(tree: Tree, normals: NDArray, angles: NDArray) -> NDArray:
-    """Return cones (node_count, 4, 16) float32 that hold the normals of a tree's children.
-
-    Parameters
-    ----------
-    normals : (n, 3)
-        Unit normals of the primitives.
-    angles : (n,)
-        Radians by which a primitive's own normals may differ from that.
-
-    Returns
-    -------
-    (node_count, 4, 16) float32
-        Unit axis, and the sine of the half angle; 2 where that is a right angle or more. A child that does not exist
-        has the sine -2.
-    """
-    out = np.zeros((tree.node_count, 4, WIDTH), np.float32)
-    axis = tree.in_slots(np.asarray(normals, np.float64).reshape(-1, 3))
-    angle = tree.in_slots(np.asarray(angles, np.float64).reshape(-1), -1.0)
-    firsts = tree.first_of_levels()
-    for level in reversed(range(len(firsts) - 1)):
-        nodes = slice(firsts[level], firsts[level + 1])
-        count = nodes.stop - nodes.start
-        missing = WIDTH * count - len(angle)
-        if missing:
-            axis = np.concatenate([axis, np.zeros((missing, 3))])
-            angle = np.concatenate([angle, np.full(missing, -1.0)])
-        axis, angle = axis.reshape(count, WIDTH, 3), angle.reshape(count, WIDTH)
-        out[nodes, :3] = axis.transpose(0, 2, 1)
-        # A hundredth of a degree covers float32 rounding.
-        sine = np.sin(np.minimum(angle + 2e-4, np.pi / 2))
-        out[nodes, 3] = np.where(angle < 0, -2, np.where(angle + 2e-4 >= np.pi / 2, 2, sine))
-        used = angle >= 0
-        mean = np.where(used[..., None], axis, 0).sum(axis=1)
-        length = np.linalg.norm(mean, axis=1, keepdims=True)
-        mean = np.where(length > 1e-9, mean / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
-        apart = 2 * np.arcsin(np.minimum(np.linalg.norm(axis - mean[:, None], axis=2) / 2, 1)) + angle
-        axis, angle = mean, np.where(used, np.minimum(apart, np.pi), -1.0).max(axis=1)
     return out
