@@ -25,7 +25,7 @@ from .render.frame import Frame
 from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
 from .render.scene import Scene
-from .render.shade import Shading
+from .render.shade import Light, Shading
 from .render.slim_drawing import SlimDrawing
 from .report.page import report
 from .surface.cloud import PointCloud
@@ -39,7 +39,7 @@ from .trace.hits import Hits, trace
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
+    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
     "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
     "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
     "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",

@@ -70,6 +70,22 @@ def test_readmes_patches_run_as_written(slim, tmp_path, monkeypatch, device):
     assert Path("scans.png").stat().st_size > 1000 and "<svg" in Path("scans.html").read_text(encoding="utf-8")
 
 
+def test_readmes_measures_run_as_written(slim, tmp_path, monkeypatch, device):
+    """README's third block, with a bumpy sphere as the scan, a noisy one, and its surface."""
+    monkeypatch.chdir(tmp_path)
+    points = clsurf.models.sphere(4000).points.astype(np.float64)
+    scan = clsurf.PointCloud(points * (1 + 0.05 * np.sin(6 * points[:, :1])))
+    noisy = clsurf.PointCloud(points + np.random.default_rng(0).normal(0, 0.005, points.shape))
+    code = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[2]
+    names = {"clsurf": clsurf, "slim": slim, "scan": scan, "noisy": noisy, "camera": clsurf.Camera.framing(slim)}
+    exec(code, names)
+    radius = np.linalg.norm(names["clean"].points + names["clean"].origin, axis=1)
+    assert np.abs(radius - 1).mean() < 0.5 * np.abs(np.linalg.norm(noisy.points + noisy.origin, axis=1) - 1).mean()
+    assert names["bends"].mean.shape == (4000,) and names["hits"].hit.sum() > 100_000
+    assert "<svg" in Path("inked.svg").read_text(encoding="utf-8")
+    assert all(Path(name).stat().st_size > 1000 for name in ("mean.png", "inked.png", "inked.svg"))
+
+
 def test_readmes_commands_exist(capsys):
     """Every `clsurf ...` line of README's second shell block names a command and options that its help knows."""
     from clsurf.cli import main
