@@ -31,7 +31,7 @@ SECONDS = (0.3, 0.15)  # of the bunny on PoCL: floor, aim
 NOISE = 0.002  # of the diagonal, in each coordinate: the noise put on the bunny
 NEAR = 16  # triangles with the nearest centroids that a distance to the surface looks at
 TAUBIN = (0.5, -0.53)
-TAUBIN_STEPS = (3, 6, 10, 20, 40, 80)  # the peers' number of steps is chosen by the truth
+TAUBIN_STEPS = (10, 20, 40, 80)  # the peers' number of steps is chosen by the truth
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,8 @@ from conftest import scan_path
 from reference.surfaces import sphere_points
 
 import clsurf
+from clsurf.analysis import smooth_mesh
+from clsurf.analysis.smooth_fits import choose_radii
 from clsurf.cli import main
 from clsurf.errors import Cancelled, InputError
 from clsurf.surface.cloud import PointCloud
@@ -168,6 +170,31 @@ def test_the_features_of_a_box_are_kept(device):
     assert angle.mean() < 2.5 and np.percentile(angle, 99) < 20
 
 
+def test_noise_and_radii_are_found(device):
+    vertices, faces, _ = sheet(60)
+    vertices[:, 2] = 0.2 * np.random.default_rng(1).normal(size=len(vertices))
+    net, _ = smooth_mesh.net_of(vertices.astype(np.float32), faces, device)
+    flat, factor = smooth_mesh.guide_and_radii(net)
+    found = choose_radii(flat.samples, flat.queries, net.rings, flat.sharp)
+    assert found.noise * net.unit == pytest.approx(0.2, rel=0.1)
+    assert np.median(factor) > 6 and flat.sharp == smooth_mesh.SHARP
+    # Waves as long as 10 edges and 5 times the noise do not let the radius grow.
+    vertices[:, 2] += np.sin(vertices[:, 0] * 0.6)
+    waves, factor = smooth_mesh.guide_and_radii(smooth_mesh.net_of(vertices.astype(np.float32), faces, device)[0])
+    assert np.median(factor) < 4.5 and waves.sharp == smooth_mesh.SHARP
+    cube, _ = smooth_mesh.guide_and_radii(smooth_mesh.net_of(*box(noise=0.012)[:2], device)[0])
+    assert cube.sharp == smooth_mesh.SHARP_CAD
+
+
+def test_noise_that_differs_from_place_to_place(device):
+    points, faces = ball(4000)
+    rough = points[:, 2] < 0
+    noise = np.where(rough, 0.015, 0.0015)[:, None] * np.random.default_rng(3).normal(size=(4000, 1))
+    clean = clsurf.smooth(Mesh(points * (1 + noise), faces), device=device)
+    error = np.linalg.norm(clean.vertices + clean.origin, axis=1) - 1
+    assert rms(error[points[:, 2] > 0.2]) < 0.0009 and rms(error[points[:, 2] < -0.2]) < 0.0055
+
+
 def test_folded_faces_unfold(device):
     vertices, faces, inside = sheet(30)
     rng = np.random.default_rng(2)
@@ -229,6 +256,9 @@ def test_odd_meshes(device):
     assert np.isfinite(clean.vertices[:801]).all() and (clean.vertices[800] == mesh.vertices[800]).all()
     assert np.isnan(clean.vertices[801]).any() and np.isfinite(clean.vertices[802]).all()
     assert rms(np.linalg.norm(clean.vertices[:800], axis=1) - 1) < 0.008
+    # A vertex far away changes nothing else.
+    far = Mesh(np.concatenate([points, [[1e5, 0, 0]]]).astype(np.float32), np.concatenate([faces, [[0, 1, 800]]]))
+    assert rms(clsurf.smooth(far, device=device).vertices[2:800] - usual[2:]) < 2e-3
     # Vertices at the same place (texture seams) move together.
     split = Mesh(points[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))
     assert rms(clsurf.smooth(split, device=device).vertices - usual[faces.ravel()]) < 2e-3

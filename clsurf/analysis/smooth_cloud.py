@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from ..build.neighbours import nearest
 from ..build.normals import estimate_normals
-from ..build.point_tree import build_point_tree, column_bounds
+from ..build.point_tree import build_point_tree
+from ..build.radius import robust_box
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
 from ..surface.cloud import PointCloud
@@ -39,8 +40,10 @@ def smooth_points(cloud, strength: float, device: Device):
     if len(points) < LEAST:
         return cloud
     normals = cloud.normals
-    box = column_bounds(points).astype(np.float64)
+    box = robust_box(points)
     unit, middle = float(np.linalg.norm(box[1] - box[0])), box.mean(axis=0)
+    if not unit > 0:
+        return cloud
     local = ((points - middle) / unit).astype(np.float32)
     normals = usable_normals(cloud, local, None if normals is None else normals[finite][first], device)
     moved, turned = projected(local, normals, strength, device)

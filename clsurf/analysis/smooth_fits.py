@@ -15,6 +15,7 @@ from ..device import Device
 from ..device.arrays import DeviceArray
 
 SURFEL = 16  # floats a surfel (guided.clh)
+ITEMS = (64,)  # work-group of kernels whose items share nothing and hold little
 RADII = 2.2 * 1.22 ** np.arange(13)  # over the spacing, up to 24
 FIRST_RADII = 7  # up to 7.3; larger ones are tried where more than LARGE_SHARE of the points take the largest
 LARGE_SHARE = 0.25
@@ -30,7 +31,7 @@ SOFT = 0.01  # risks that differ by this much of the noise's variance count by 1
 RISK_ROUNDS, RADIUS_ROUNDS = 16, 5  # of means over neighbours: of squared residuals, of radii
 RADIUS_SHARE = 0.84  # of the radius of least risk of heights: normals ask for a little less bias
 OUTLIER = 5.0  # times the residuals around; larger ones count as this
-CLEARLY = 3.0  # ratio of noise variances
+CLEARLY = (2.0, 4.0)  # ratios of noise variances
 LEAST_NOISE = 1e-14  # of a scan of diagonal 1: float32 rounds to 6e-8
 FIT_SHARE = 1.31  # residuals have 1 - FIT_SHARE leverage of the noise's variance: the fit itself 0.69 of its leverage
 # Shapes with sharp edges: the excess of squared residuals at 4 spacings under weights that fall with the angle, over
@@ -89,7 +90,7 @@ class Rings:
         a, b = device.upload(wide), device.empty(wide.shape, np.float32)
         kernel = device.kernel("analysis/ring_means.cl")
         for _ in range(rounds):
-            kernel((self.count,), local_size(device), self.count, self.offset, self.near, a, b)
+            kernel((self.count,), ITEMS, self.count, self.offset, self.near, a, b)
             a, b = b, a
         return device.download(a)[:, :columns]
 
@@ -115,11 +116,6 @@ class Queries:
     count: int
     stride: int
     arrays: DeviceArray  # at least (6, stride) float32: position, unit normal
-
-
-def local_size(device: Device) -> tuple[int]:
-    """Return a work-group size for kernels whose items share nothing."""
-    return (1,) if device.lanes > 1 and device.kind != "cpu" else (64,)
 
 
 def lanes_size(device: Device) -> tuple[int]:
@@ -172,7 +168,7 @@ def guided_fits(samples: Samples, radii: NDArray, sharp: float, step: float = ST
         (packets(device, count),), lanes_size(device), count, device.upload(center), device.upload(radius), sharp / 8,
         *samples.arguments, records)
     balls = device.empty((4, padded), np.float32)
-    device.kernel("analysis/guided_balls.cl")((padded,), local_size(device), count, padded, records, balls)
+    device.kernel("analysis/guided_balls.cl")((padded,), ITEMS, count, padded, records, balls)
     radius_of = np.full(padded, -1, np.float32)
     radius_of[:count] = radius
     boxes, node_offset, top_level = build_boxes(balls, padded, device, radius=device.upload(radius_of))
@@ -241,10 +237,13 @@ def local_noise(mean2: NDArray, own: NDArray, noise2: float) -> NDArray:
     """Return the noise variance (n, 1) at every query: the scan's, unless the place speaks clearly against it.
 
     Generalised cross-validation tells the noise from mean squared residuals (n, r) of fits with leverage `own`. Taken
-    everywhere it costs 1 % of error on evenly noisy meshes; so the scan's noise stands where the two agree to CLEARLY.
+    everywhere it costs 1 % of error on evenly noisy meshes; so the scan's noise stands where the two agree to
+    CLEARLY[0], and the place's own where they differ by more than CLEARLY[1].
     """
-    here = (mean2 / np.maximum(1 - own, 0.2) ** 2).min(axis=1, keepdims=True)
-    return np.maximum(np.clip(noise2, here / CLEARLY, here * CLEARLY), LEAST_NOISE)
+    here = np.maximum((mean2 / np.maximum(1 - own, 0.2) ** 2).min(axis=1, keepdims=True), LEAST_NOISE)
+    away = np.log(here / noise2)
+    low, high = np.log(CLEARLY)
+    return noise2 * np.exp(away * np.clip((np.abs(away) - low) / (high - low), 0, 1))
 
 
 def excess_of(residual2: NDArray, own: NDArray, noise2: float) -> float:

@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..build.point_tree import BLOCK, build_boxes, column_bounds, morton_order
+from ..build.point_tree import BLOCK, build_boxes, morton_order
+from ..build.radius import robust_box
 from ..device import Device
 from ..device.arrays import DeviceArray
 from ..io.cleaning import first_of_duplicates
 from .smooth_fits import (
+    ITEMS,
     LAST_STEP,
     SHARP,
     Queries,
@@ -20,7 +22,6 @@ from .smooth_fits import (
     choose_radii,
     guided_fits,
     has_edges,
-    local_size,
     queries_of,
 )
 
@@ -88,7 +89,7 @@ def net_of(points: NDArray, faces: NDArray, device: Device) -> tuple[Net, NDArra
     corners = points if len(first) == len(points) else points[first]
     inside = np.zeros(len(corners), bool)
     inside[faces] = True
-    box = column_bounds(corners if inside.all() else corners[inside]).astype(np.float64)
+    box = robust_box(corners if inside.all() else corners[inside])
     unit = float(np.linalg.norm(box[1] - box[0]))
     if not (np.isfinite(unit) and unit > 0):
         return None
@@ -126,17 +127,16 @@ def _net(used, vertices, faces, middle, unit, device) -> Net:
 def guide_rows(net: Net, sharps: tuple) -> tuple[DeviceArray, NDArray]:
     """Return rows (f, ROW) of the faces with filtered normals, and the faces' areas."""
     device, count = net.device, len(net.faces)
-    size = local_size(device)
     rows, other = device.empty((count, ROW), np.float32), device.empty((count, ROW), np.float32)
-    device.kernel("analysis/guided_planes.cl")((count,), size, count, net.faces_on_device, device.upload(net.vertices),
+    device.kernel("analysis/guided_planes.cl")((count,), ITEMS, count, net.faces_on_device, device.upload(net.vertices),
                                                1.0, rows)
     areas = device.download(rows)[:, 3].copy()
     mean = max(float(areas.mean(dtype=np.float64)), 1e-30)
-    device.kernel("analysis/guided_planes.cl")((count,), size, count, net.faces_on_device, device.upload(net.vertices),
+    device.kernel("analysis/guided_planes.cl")((count,), ITEMS, count, net.faces_on_device, device.upload(net.vertices),
                                                1.0 / mean, rows)
     width2 = 2 * GUIDE_WIDTH**2 * edge_length(mean) ** 2
     for sharp in sharps:
-        device.kernel("analysis/guided_normals.cl")((count,), size, count, net.faces_on_device, net.offset,
+        device.kernel("analysis/guided_normals.cl")((count,), ITEMS, count, net.faces_on_device, net.offset,
                                                     net.faces_of, rows, 1.0 / width2, sharp, other)
         rows, other = other, rows
     return rows, areas
@@ -152,7 +152,7 @@ def samples_of(net: Net, rows: DeviceArray, spacing: NDArray) -> Samples:
     device, count = net.device, len(net.faces)
     padded = -(-count // BLOCK) * BLOCK
     arrays = device.empty((7, padded), np.float32)
-    device.kernel("analysis/guided_rows.cl")((padded,), local_size(device), count, padded, rows, arrays)
+    device.kernel("analysis/guided_rows.cl")((padded,), ITEMS, count, padded, rows, arrays)
     boxes, node_offset, top_level = build_boxes(arrays, padded, device)
     return Samples(device, count, padded, arrays, boxes, node_offset, top_level, spacing, 2.0)
 
@@ -238,7 +238,7 @@ def move_vertices(net: Net, vertices: NDArray, normals: NDArray, kind: NDArray) 
     a, b = device.empty((count, 3), np.float32), device.empty((count, 3), np.float32)
     kernel = device.kernel("analysis/move_vertices.cl")
     for step in range(MOVES):
-        kernel((count,), local_size(device), count, net.offset, net.faces_of, net.faces_on_device, wanted, kind, RELAX,
+        kernel((count,), ITEMS, count, net.offset, net.faces_of, net.faces_on_device, wanted, kind, RELAX,
                a if step else start, b)
         a, b = b, a
     return device.download(a)
@@ -252,7 +252,7 @@ def place_vertices(net: Net, samples: Samples, found: NDArray, kind: NDArray) ->
     planes[:, :3] = found[1:4].T
     planes[:, 3] = (centroid * found[1:4]).sum(axis=0) - found[0]
     out = device.empty((count, 3), np.float32)
-    device.kernel("analysis/place_vertices.cl")((count,), local_size(device), count, net.offset, net.faces_of,
+    device.kernel("analysis/place_vertices.cl")((count,), ITEMS, count, net.offset, net.faces_of,
                                                 device.upload(planes), device.upload(kind),
                                                 device.upload(net.vertices), out)
     return device.download(out)
