@@ -182,6 +182,16 @@ def test_strays_are_unknown_and_harm_nobody(device):
     assert np.isnan(found.mean[4000:]).all()
 
 
+def test_outliers_near_the_surface_are_left_out(device):
+    points, normals, mean, _ = curved.torus(12000)
+    rng = np.random.default_rng(3)
+    wrong = rng.random(12000) < 0.02
+    moved = points + np.where(wrong[:, None], rng.normal(size=points.shape) * 0.15, 0)
+    found = curvature(cloud_of(moved, normals), device=device)
+    error = np.abs(found.mean - mean)[~wrong] / np.sqrt(np.mean(mean**2))
+    assert np.isfinite(error).all() and np.median(error) < 0.01 and np.quantile(error, 0.99) < 0.2
+
+
 def test_points_that_cannot_be_used_are_nan(device):
     points, normals, _, _ = curved.sphere(1000, 1.0)
     points, normals = points.astype(np.float32), normals.astype(np.float32)

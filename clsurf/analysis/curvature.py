@@ -203,7 +203,7 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
     plan = _plan(tree, None if radius == "auto" else float(radius) / unit, report)
     tree = plan.tree
     report("surfels", 0.0)
-    surfels = fit_surfels(tree, plan.block_radius, plan.noise)
+    surfels = fit_surfels(tree, plan.block_radius, plan.noise, plan.spacing)
     report("surfels", 1.0)
     world_middle = middle + scan.origin
     if points is not None:
@@ -224,6 +224,7 @@ class _Plan:
     tree: PointTree
     block_radius: NDArray  # (blocks,) float32, of the surfels in every block of 16 points
     noise: float  # over the point spacing
+    spacing: float  # of the points, in the tree's units
 
 
 def _plan(tree: PointTree, radius: float | None, report) -> _Plan:
@@ -236,11 +237,11 @@ def _plan(tree: PointTree, radius: float | None, report) -> _Plan:
             tree = risk.with_mean_normals(tree, NORMAL_REACH * spacing)
     report("noise", 0.3)
     if radius is not None:
-        return _Plan(tree, np.full(tree.padded // BLOCK, radius, np.float32), sigma / spacing)
+        return _Plan(tree, np.full(tree.padded // BLOCK, radius, np.float32), sigma / spacing, spacing)
     fits = risk.two_degree_fits(tree, samples)
     found = RADIUS_RATIO * risk.least_risk_radius(samples, fits, sigma)
     report("noise", 1.0)
-    return _Plan(tree, risk.block_radii(tree, samples, found), sigma / spacing)
+    return _Plan(tree, risk.block_radii(tree, samples, found), sigma / spacing, spacing)
 
 
 def _near_scan(tree: PointTree, queries: NDArray, device: Device) -> NDArray:

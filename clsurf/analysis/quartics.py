@@ -18,6 +18,7 @@ RADIUS_RATIO = 1.65
 # with 0.1 % noise 0.0197 and 0.0187) for twice the fits, which are few where there is noise.
 SPACING = (0.35, 0.25)
 NOISY = 0.1  # point spacings of noise from which on points count as noisy, gradually
+PLAIN = (3.0, 0.02)  # times the noise, and point spacings: a fit that leaves no more has no outliers
 GROWTH = 3.0  # times that a ball with too few points may grow
 TINY = 100  # points of a scan whose balls may grow to hold all of it
 # Added to the terms of degree 3 and 4 of noisy points on the diagonal, over the sum of weights: at rims, where the
@@ -48,7 +49,7 @@ class SurfelTree:
     top_level: int
 
 
-def fit_surfels(tree: PointTree, block_radius: NDArray, noise: float = 0.0) -> SurfelTree:
+def fit_surfels(tree: PointTree, block_radius: NDArray, noise: float = 0.0, spacing: float = 1.0) -> SurfelTree:
     """Return surfels of degree 4 that cover the points.
 
     Parameters
@@ -57,18 +58,20 @@ def fit_surfels(tree: PointTree, block_radius: NDArray, noise: float = 0.0) -> S
         Of the surfels in every block of 16 points, in the tree's units.
     noise : float
         Its standard deviation over the point spacing.
+    spacing : float
+        Of the points, in the tree's units.
     """
     device = tree.device
     noisy = min(1.0, noise / NOISY) ** 2
-    spacing = SPACING[0] + noisy * (SPACING[1] - SPACING[0])
-    centers = device.upload(spread_centers(tree, spacing * block_radius))
+    share = SPACING[0] + noisy * (SPACING[1] - SPACING[0])
+    centers = device.upload(spread_centers(tree, share * block_radius))
     count = len(centers)
     padded = -(-count // BLOCK) * BLOCK
     growth = max(GROWTH, 2 / float(block_radius.min())) if tree.count < TINY else GROWTH
     records, balls = device.empty((padded, SURFEL), np.float32), device.empty((4, padded), np.float32)
     device.kernel("analysis/fit_quartics.cl")(
         (padded,), (1,), count, padded, centers, device.upload(block_radius), growth, noisy * RIDGE[0],
-        noisy * RIDGE[1], *tree.arguments, records, balls)
+        noisy * RIDGE[1], max(PLAIN[0] * noise, PLAIN[1]) * spacing, *tree.arguments, records, balls)
     radius = device.upload(device.download(balls)[3])
     return SurfelTree(device, DEGREE, records, padded, balls, *build_boxes(balls, padded, device, radius=radius))
 

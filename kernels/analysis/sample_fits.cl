@@ -26,7 +26,7 @@ __kernel void sample_fits(int samples, int radii, __global const int *center, __
   Frame frame = frame_at(own[3 * n], own[4 * n], own[5 * n]), *f = &frame;
   Sums sums;
   float a[TERMS], c[TERMS];
-  sum_ball(&sums, f, x, y, z, radius, padded, sorted, boxes, node_offset, top_level);
+  sum_ball(&sums, a, 0.0f, f, x, y, z, radius, padded, sorted, boxes, node_offset, top_level);
   float weight = sums.row[0].s[0];
   eliminate(&sums, TERMS);
   o[0] = sums.count;
