@@ -23,6 +23,7 @@ from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
 from ..surface.slim import COEFFICIENTS, SlimSurface
 from ..surface.srgb import premultiplied, straight
+from .large_faces import large_faces, with_middles
 from .point_tree import BLOCK, FAR_POINT, PointTree, build_point_tree
 from .project import leaf_tree, project_sorted
 from .radius import LEAST_PENALTY, Noise, automatic_error, measure_noise, robust_box, segment_end
@@ -133,7 +134,10 @@ class Points:
 
 
 def usable_points(scan, weight, device) -> Points:
-    """Return the points of `scan` that are finite and have a normal and a weight, with what belongs to them."""
+    """Return the points of `scan` that are finite and have a normal and a weight, with what belongs to them.
+
+    The middles of a mesh's large faces are points too.
+    """
     weights = None
     if weight is not None:
         weights = np.ascontiguousarray(weight, np.float32)
@@ -143,6 +147,9 @@ def usable_points(scan, weight, device) -> Points:
     colors = vertex_colors(scan)
     if normals is None and isinstance(scan, Mesh) and len(scan.faces):
         normals = face_normals(position, scan.faces)
+    if isinstance(scan, Mesh):
+        position, normals, colors, weights = with_middles(position, normals, colors, weights,
+                                                          large_faces(position, scan.faces))
     usable = np.ones(len(position), bool)
     if not np.isfinite(position).all():
         usable &= np.isfinite(position).all(axis=1)

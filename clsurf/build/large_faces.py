@@ -1,0 +1,56 @@
+"""The middles of faces that are large against their neighbours, as points: no vertex tells of the surface there."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Longest edges over the median one. Where a mesh's holes were closed by large faces, leaves cover its vertices and
+# little between them: the dragon at T 0.005 showed its inside in 13 places of a picture of 1024 x 1024, with the
+# middles of 2 % of its faces in one or none, for 1.2 % more leaves. 2.0 takes 8 % more, 3.0 leaves 3 places.
+LARGE = 2.5
+SAMPLE = 20_000  # faces that give the median
+
+
+def large_faces(points: NDArray, faces: NDArray) -> NDArray:
+    """Return the faces (k, 3) whose longest edge is over LARGE times the median longest edge.
+
+    Parameters
+    ----------
+    points : (v, 3) float32
+    faces : (f, 3) int32
+    """
+    if not len(faces) or not np.isfinite(points).any():
+        return faces[:0]
+    limit2 = LARGE**2 * np.nanmedian(longest2(points, faces[::max(1, len(faces) // SAMPLE)]))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return faces[longest2(points, faces) > limit2] if np.isfinite(limit2) else faces[:0]
+
+
+def longest2(points: NDArray, faces: NDArray) -> NDArray:
+    """Return the squared length (f,) of every face's longest edge; column by column, four times as fast as by rows."""
+    longest = np.zeros(len(faces), points.dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        columns = [[points[:, axis][faces[:, corner]] for corner in range(3)] for axis in range(3)]
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            np.maximum(longest, sum((column[a] - column[b]) ** 2 for column in columns), out=longest)
+    return longest
+
+
+def with_middles(position, normals, colors, weights, faces) -> tuple:
+    """Return the arrays of the vertices, those that are not None with the middles of `faces` (k, 3) at their end.
+
+    The middles have their face's normal on the side of its vertices' normals, the mean colour and the least weight.
+    """
+    if not len(faces):
+        return position, normals, colors, weights
+    corners = position[faces]
+    if normals is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+            normal *= np.where((normals[faces].sum(axis=1) * normal).sum(axis=1, keepdims=True) < 0, -1, 1)
+        normals = np.concatenate([normals, normal.astype(np.float32)])
+    if colors is not None:
+        colors = np.concatenate([colors, np.round(colors[faces].mean(axis=1)).astype(colors.dtype)])
+    if weights is not None:
+        weights = np.concatenate([weights, weights[faces].min(axis=1)])
+    return np.concatenate([position, corners.mean(axis=1)]), normals, colors, weights
