@@ -12,7 +12,7 @@ from clsurf.models import perfect_sphere
 from clsurf.models.basic import torus
 from clsurf.render.camera import Camera
 from clsurf.render.patch_drawing import PatchDrawing
-from clsurf.render.patches import place_patches, upload_patches
+from clsurf.render.patches import patch_constants, place_patches, prepare_patches, upload_patches
 from clsurf.render.renderer import Renderer
 from clsurf.render.scene import Scene
 from clsurf.render.shade import Shading
@@ -77,9 +77,12 @@ def test_prepare_patches(device, precise):
     upload = upload_patches(device, surface)
     cells, borders, slopes = twin.prepare_patches(surface)
     shown = surface.opaque
-    assert np.array_equal(device.download(upload.cells) > 0, cells)
-    np.testing.assert_allclose(device.download(upload.borders), borders, atol=1e-5)
-    np.testing.assert_allclose(device.download(upload.slopes)[shown], slopes[shown], rtol=1e-5)
+    got = [device.download(a) for a in prepare_patches(
+        device, patch_constants(upload), upload.frames, upload.sizes, upload.offsets, upload.count, upload.colors,
+        upload.heights)]
+    assert np.array_equal(got[0] > 0, cells)
+    np.testing.assert_allclose(got[1], borders, atol=1e-5)
+    np.testing.assert_allclose(got[2][shown], slopes[shown], rtol=1e-5)
 
 
 @pytest.mark.parametrize("lanes", [16, 1])

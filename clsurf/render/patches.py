@@ -40,10 +40,6 @@ class PatchUpload:
     offsets: DeviceArray  # (count + 1,) uint32
     heights: DeviceArray  # (N,) int8 or int32
     colors: DeviceArray  # (N * channels,) uint8
-    cells: DeviceArray  # (N,) uint8: 1 where the cell is drawn
-    borders: DeviceArray  # (N,) float32: distance to the border of what is drawn, model units
-    slopes: DeviceArray  # (N, 2) float32: displacement steps per node
-    linear: DeviceArray  # (256,) float32
     color: NDArray | None  # (3,) float64, linear
     largest_border: float  # model units
     spacing: float  # median node spacing, model units
@@ -107,13 +103,12 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
     colors = device.upload(surface.colors.reshape(-1) if channels and nodes else np.zeros(4, np.uint8))
     sizes = device.upload(np.ascontiguousarray(surface.size))
     offsets = device.upload(surface.node_offset.astype(np.uint32))
+    # pack_patches writes into the frames, and an upload may be read-only.
     host_frames, frames = frames, device.empty(frames.shape, np.float32)
     device.write(frames, host_frames)
-    cells, borders = device.empty(max(nodes, 1), np.uint8), device.empty(max(nodes, 1), np.float32)
-    slopes = device.empty((max(nodes, 1), 2), np.float32)
     precise = surface.displacements.dtype == np.int32
-    device.kernel("render/prepare_patches.cl", constants={"CHANNELS": channels, "PRECISE": precise})(
-        (p,), None, frames, sizes, offsets, p, colors, heights, cells, borders, slopes)
+    cells, borders, slopes = prepare_patches(device, {"CHANNELS": channels, "PRECISE": precise}, frames, sizes, offsets,
+                                             p, colors, heights)
     largest = float(device.download(borders, copy=False)[:nodes].max(initial=0.0)) if nodes else 0.0
     color = None if surface.color is None else to_linear(surface.color / 255)
     linear = device.upload(LINEAR_OF_BYTE.astype(np.float32))
@@ -122,9 +117,29 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
     device.kernel("render/pack_patches.cl", constants={"CHANNELS": channels, "PRECISE": precise})(
         (p,), None, frames, sizes, offsets, p, colors, linear, heights, cells, borders, slopes,
         LARGEST_RIM / max(largest, 1e-30), steps, rims, packed)
-    return PatchUpload(p, channels, precise, frames, sizes, offsets, heights, colors, cells, borders, slopes,
-                       linear, color, largest, spacing, surface.origin, center, reach, steps, rims, packed,
+    return PatchUpload(p, channels, precise, frames, sizes, offsets, heights, colors, color, largest, spacing,
+                       surface.origin, center, reach, steps, rims, packed,
                        int(surface.size[0].prod()) if p and surface.equal_sizes else 0, weakref.ref(surface))
+
+
+def prepare_patches(device: Device, constants: dict, frames: DeviceArray, sizes: DeviceArray, offsets: DeviceArray,
+                    count: int, colors: DeviceArray, heights: DeviceArray) -> tuple[DeviceArray, ...]:
+    """Work out what the packing of nodes needs to know of them.
+
+    Returns
+    -------
+    cells : (N,) uint8
+        1 where the cell is drawn.
+    borders : (N,) float32
+        Distance to the border of what is drawn, model units.
+    slopes : (N, 2) float32
+        Displacement steps per node.
+    """
+    nodes = heights.shape[0]
+    out = device.empty(nodes, np.uint8), device.empty(nodes, np.float32), device.empty((nodes, 2), np.float32)
+    device.kernel("render/prepare_patches.cl", constants=constants)(
+        (count,), None, frames, sizes, offsets, count, colors, heights, *out)
+    return out
 
 
 def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, shading: Shading) -> NDArray:
