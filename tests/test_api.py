@@ -74,7 +74,7 @@ def test_readmes_measures_run_as_written(slim, tmp_path, monkeypatch, device):
     """README's third block, with a bumpy sphere as the scan, a noisy one, and its surface."""
     monkeypatch.chdir(tmp_path)
     points = clsurf.models.sphere(4000).points.astype(np.float64)
-    scan = clsurf.PointCloud(points * (1 + 0.05 * np.sin(6 * points[:, :1])))
+    scan = clsurf.PointCloud(points * (1 + 0.05 * np.sin(6 * points[:, :1])) + slim.bounds.mean(axis=0))
     noisy = clsurf.PointCloud(points + np.random.default_rng(0).normal(0, 0.005, points.shape))
     code = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[2]
     names = {"clsurf": clsurf, "slim": slim, "scan": scan, "noisy": noisy, "camera": clsurf.Camera.framing(slim)}
