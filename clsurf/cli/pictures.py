@@ -10,6 +10,7 @@ from ..errors import InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
 from .color_maps import ChannelOption, LegendOption, LimitOption, channel_picture
 from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
+from .lights import LightOption, MirrorOption, OcclusionOption, ShadowsOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
 
@@ -64,8 +65,9 @@ def render(source: SourceArgument,
            channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id, and "
                                                       "those of --channel; .png and .jpg show "
                                                       "color.")] = "color,depth,normal",
-           shading: LookOption = "phong", supersampling: SamplesOption = 1, lod: LodOption = 4.0,
-           nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
+           shading: LookOption = "phong", light: LightOption = None, shadows: ShadowsOption = False,
+           occlusion: OcclusionOption = 0, mirror: MirrorOption = 0.0, supersampling: SamplesOption = 1,
+           lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
@@ -87,7 +89,8 @@ def render(source: SourceArgument,
                          "write .exr")
     view = checked_view(direction, up, fov, eye, target, ortho)
     how = recipe(kind, degree, error, patches=patches, spacing=spacing)
-    looks, lod, drawing = clsurf.Shading(look=shading), checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    lit = lighting(shading, light, shadows, occlusion, mirror)
+    lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     checked_supersampling(supersampling)
     if colored:
         colored.prepared(how, degree)
@@ -101,10 +104,10 @@ def render(source: SourceArgument,
     chosen.profile = Profile() if profile else None
     with steps.step("draw"):
         if colored:
-            frame = colored.draw(thing, camera, picture_size, looks, lod, supersampling, drawing, chosen)
+            frame = colored.draw(thing, camera, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         else:
-            frame = clsurf.render(thing, camera, picture_size, wanted, looks, lod, device=chosen,
-                                  supersampling=supersampling, patches=drawing)
+            frame = clsurf.render(lit.scene(thing, camera), camera, picture_size, wanted, lit.shading, lod,
+                                  device=chosen, supersampling=supersampling, patches=drawing)
     if profile:
         print(chosen.profile)
         chosen.profile = None

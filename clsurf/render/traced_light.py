@@ -50,8 +50,8 @@ def light_grid(device: Device, scratch: Scratch, grid: Grid, scene, camera, shad
         lights = sphere_lamps(shading.occlusion, camera)
         count = len(lights)
         directions = device.upload(lights)
+        device.check_memory(hidden=8 * count * bins)
         hidden = scratch.array("hidden", (bins, count // 32, 64), np.uint32)
-        device.check_memory(hidden=hidden.nbytes)
         reach = shading.occlusion_reach
         if reach is None:
             reach = REACH * float(np.linalg.norm(np.nan_to_num(scene.bounds[1] - scene.bounds[0], nan=np.inf)))
