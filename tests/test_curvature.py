@@ -10,6 +10,7 @@ from reference import curved
 import clsurf
 from clsurf.analysis import quartics
 from clsurf.analysis.curvature import curvature
+from clsurf.build import slim
 from clsurf.build.point_tree import build_point_tree
 from clsurf.errors import Cancelled, InputError
 from clsurf.surface.cloud import PointCloud
@@ -299,6 +300,20 @@ def test_slim_surfaces_blend_their_own_surfels(degree, tolerance, device):
     assert np.sqrt(np.mean((found.mean - mean[::10]) ** 2)) < tolerance * np.sqrt(np.mean(mean**2))
     np.testing.assert_allclose(found.position, points[::10], atol=1e-3)
     assert len(curvature(surface, device=device)) == surface.leaf.sum()
+
+
+@pytest.mark.parametrize(("degree", "order"), [(2, 1.2), (3, 1.6)])
+def test_order_of_slim_surfaces(degree, order, device):
+    points, normals, mean, _ = curved.torus(12000)
+    usable = slim.usable_points(cloud_of(points, normals), None, device)
+    tree = build_point_tree(usable.position, usable.normals, np.zeros(3, np.float32), 0.25, device)
+    errors = []
+    for radius in (0.08, 0.04):  # one level of leaves of this radius, over the diagonal
+        levels = slim.build_levels(tree, degree, 1e-15, slim.measure_noise(tree), lambda *_: None, radius)
+        surface = slim.assemble(levels, usable, tree, degree, 0.01, 4.0, np.zeros(3))
+        found = curvature(surface, points[::40], device=device)
+        errors.append(np.sqrt(np.mean((found.mean - mean[::40]) ** 2)))
+    assert np.log2(errors[0] / errors[1]) > order
 
 
 def test_planes_have_no_curvature(device):
