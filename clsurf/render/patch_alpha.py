@@ -6,6 +6,8 @@ a surface hides what is behind a sample or is not there, and the smooth edge com
 sample decides for itself. Nodes of RGBA colours take part with their own alpha.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,9 +50,7 @@ def extended(surface: PatchSurface) -> tuple[PatchSurface, NDArray]:
         own[new, :3] = np.maximum(np.rint(sums[new] / near[new][:, None]), 1)  # never pure black
         own[..., 3:][new | shown] = 255
         colors[nodes] = own.reshape(-1, colors.shape[1])
-    return PatchSurface(surface.origins, surface.axis_x, surface.axis_y, surface.axis_z_length, surface.size, d, colors,
-                        surface.color, surface.origin, surface.diagonal, surface.bound, surface.bound_share,
-                        surface.oriented), alphas
+    return replace(surface, displacements=d, colors=colors), alphas
 
 
 def _carried_on(d, shown):

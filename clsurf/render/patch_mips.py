@@ -5,6 +5,7 @@ same patches in the same order, so that every mode draws it.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +34,12 @@ def with_levels(surface: PatchSurface, most: int) -> tuple[PatchSurface, int]:
     count = len(levels)
     patch = np.concatenate([np.repeat(np.arange(len(s)), np.diff(s.node_offset)) for s in levels])
     order = np.argsort(patch, kind="stable")
-    mixed = lambda name: np.stack([getattr(s, name) for s in levels], axis=1).reshape(  # noqa: E731
-        len(surface) * count, *getattr(surface, name).shape[1:])
     colors = None if surface.colors is None else np.concatenate([s.colors for s in levels])[order]
-    return PatchSurface(
-        mixed("origins"), mixed("axis_x"), mixed("axis_y"), mixed("axis_z_length"), mixed("size"),
-        np.concatenate([s.displacements for s in levels])[order], colors, surface.color, surface.origin,
-        surface.diagonal, surface.bound, surface.bound_share, surface.oriented), count
+    mixed = {name: np.stack([getattr(s, name) for s in levels], axis=1).reshape(
+        len(surface) * count, *getattr(surface, name).shape[1:])
+        for name in ("origins", "axis_x", "axis_y", "axis_z_length", "size")}
+    return replace(surface, **mixed, displacements=np.concatenate([s.displacements for s in levels])[order],
+                   colors=colors), count
 
 
 def halved(surface: PatchSurface) -> PatchSurface:
@@ -63,9 +63,8 @@ def halved(surface: PatchSurface) -> PatchSurface:
     d = np.where(opaque, np.rint(values[:, 0]), least if surface.colors is None else 0).astype(kind)
     colors = None if surface.colors is None else _encoded(values[:, 1:], opaque)
     scale = (size - 1) / (coarse - 1)
-    return PatchSurface(
-        surface.origins, surface.axis_x * scale[:, :1], surface.axis_y * scale[:, 1:], surface.axis_z_length, coarse, d,
-        colors, surface.color, surface.origin, surface.diagonal, surface.bound, surface.bound_share, surface.oriented)
+    return replace(surface, axis_x=surface.axis_x * scale[:, :1], axis_y=surface.axis_y * scale[:, 1:], size=coarse,
+                   displacements=d, colors=colors)
 
 
 def by_size(surface: PatchSurface) -> Iterator[tuple[NDArray, NDArray | slice, int, int]]:
