@@ -22,7 +22,7 @@ from .shade import Look, Shading, new_channels, shade_constants
 from .tiles import Grid, Scratch, view_floats
 
 FRAME_FLOATS, PATCH_FLOATS = 16, 24  # kernels/common/patch.clh
-LAYERS = (1 << 20) - 2  # kernels/render/patch_planes.clh
+LAYERS = (1 << 20) - 2  # kernels/render/patch_cells.clh
 LAYER_SPACINGS = 0.25  # samples of one surface within this many node spacings of depth are one layer
 LARGEST_RIM = 16383.0  # kernels/common/patch.clh
 LARGEST_COUNT = (1 << 32) - 2  # a node's number is a payload of 32 bits
