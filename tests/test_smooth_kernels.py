@@ -133,8 +133,8 @@ def test_ring_means(device):
     offset = np.concatenate([[0], np.cumsum([len(near) for near in lists])]).astype(np.int32)
     rings = Rings(device, 50, device.upload(offset), device.upload(np.concatenate(lists), np.int32))
     values = rng.normal(size=(50, 3))
-    assert np.allclose(rings.means(values, 1), twin.ring_means(values, lists), atol=1e-6)
-    assert np.allclose(rings.means(values, 2), twin.ring_means(twin.ring_means(values, lists), lists), atol=1e-6)
+    assert np.allclose(rings.means(values.T, 1).T, twin.ring_means(values, lists), atol=1e-6)
+    assert np.allclose(rings.means(values.T, 2).T, twin.ring_means(twin.ring_means(values, lists), lists), atol=1e-6)
 
 
 def test_move_vertices(net, monkeypatch):

@@ -92,7 +92,7 @@ def projected(points: NDArray, normals: NDArray, strength: float, device: Device
     # A disc of the radius of the 12th neighbour holds 12.5 points; an even triangle mesh has an edge of 1.07 times the
     # root of the area of a point.
     spacing = 1.0746 * reach * np.sqrt(np.pi / (index.shape[1] + 0.5))
-    spacing = np.exp(rings.means(np.log(np.maximum(spacing, 1e-7))[:, None], 2)[:, 0])
+    spacing = np.exp(rings.means(np.log(np.maximum(spacing, 1e-7))[None], 2)[0])
     samples = Samples(device, tree.count, tree.padded, tree.sorted, tree.boxes, tree.node_offset, tree.top_level,
                       spacing, 1.0)
     queries = Queries(tree.count, tree.padded, tree.sorted)

@@ -28,7 +28,8 @@ LEVERAGE = {1.0: ([1.0, 3.0, 7.3, 11.2, 16.8, 25.0, 37.5, 56.0, 83.0, 124.0],
             2.0: ([1.0, 4.0, 8.0, 14.2, 21.2, 31.5, 46.1, 69.1, 103.5, 152.9],
                   [1.0, 0.9, 0.55, 0.335, 0.2605, 0.1937, 0.1404, 0.0965, 0.0648, 0.0438])}
 SOFT = 0.01  # risks that differ by this much of the noise's variance count by 1 : 1/e in the mean radius
-RISK_ROUNDS, RADIUS_ROUNDS = 16, 5  # of means over neighbours: of squared residuals, of radii
+# Of means over neighbours: of squared residuals, of those that limit outliers, of radii.
+RISK_ROUNDS, OUTLIER_ROUNDS, RADIUS_ROUNDS = 16, 6, 5
 RADIUS_SHARE = 0.84  # of the radius of least risk of heights: normals ask for a little less bias
 OUTLIER = 5.0  # times the residuals around; larger ones count as this
 CLEARLY = (2.0, 4.0)  # ratios of noise variances
@@ -83,16 +84,16 @@ class Rings:
     near: DeviceArray  # int32
 
     def means(self, values: NDArray, rounds: int) -> NDArray:
-        """Return `values` (n, c), c at most 16, averaged over neighbours `rounds` times."""
-        device, columns = self.device, values.shape[1]
+        """Return `values` (c, n), c at most 16, averaged over neighbours `rounds` times, (c, n) float32."""
+        device, rows = self.device, len(values)
         wide = np.zeros((self.count, 16), np.float32)
-        wide[:, :columns] = values
+        wide[:, :rows] = values.T
         a, b = device.upload(wide), device.empty(wide.shape, np.float32)
         kernel = device.kernel("analysis/ring_means.cl")
         for _ in range(rounds):
             kernel((self.count,), ITEMS, self.count, self.offset, self.near, a, b)
             a, b = b, a
-        return device.download(a)[:, :columns]
+        return np.ascontiguousarray(device.download(a, copy=False)[:, :rows].T)
 
 
 @dataclass(eq=False)
@@ -221,26 +222,26 @@ def choose_radii(samples: Samples, queries: Queries, rings: Rings, sharp: float)
             continue
         if k == FIRST_RADII - 1:
             noise2 = noise_variance(residual2[NOISE_RADIUS], own[NOISE_RADIUS])
-            limit = OUTLIER**2 * rings.means(residual2[NOISE_RADIUS][:, None], RISK_ROUNDS)
-        mean2, share = rings.means(np.minimum(np.stack(residual2, axis=1), limit), RISK_ROUNDS), np.stack(own, axis=1)
+            limit = OUTLIER**2 * rings.means(residual2[NOISE_RADIUS][None], OUTLIER_ROUNDS)
+        mean2, share = rings.means(np.minimum(np.stack(residual2), limit), RISK_ROUNDS), np.stack(own)
         risk = mean2 / local_noise(mean2, share, noise2) + 2 * share
-        weight = np.exp((risk.min(axis=1, keepdims=True) - risk) / SOFT)
-        weight /= weight.sum(axis=1, keepdims=True)
-        if weight[:, -1].mean() < LARGE_SHARE:
+        weight = np.exp((risk.min(axis=0) - risk) / np.float32(SOFT))
+        weight /= weight.sum(axis=0)
+        if weight[-1].mean() < LARGE_SHARE:
             break
-    factor = np.exp(rings.means(weight @ np.log(RADII[:weight.shape[1], None]), RADIUS_ROUNDS)[:, 0])
+    factor = np.exp(rings.means((np.log(RADII[:len(weight)]) @ weight)[None], RADIUS_ROUNDS)[0])
     return Choice(RADIUS_SHARE * factor, float(np.sqrt(noise2)),
                   excess_of(residual2[EDGE_RADIUS], own[EDGE_RADIUS], noise2))
 
 
 def local_noise(mean2: NDArray, own: NDArray, noise2: float) -> NDArray:
-    """Return the noise variance (n, 1) at every query: the scan's, unless the place speaks clearly against it.
+    """Return the noise variance (n,) at every query: the scan's, unless the place speaks clearly against it.
 
-    Generalised cross-validation tells the noise from mean squared residuals (n, r) of fits with leverage `own`. Taken
+    Generalised cross-validation tells the noise from mean squared residuals (r, n) of fits with leverage `own`. Taken
     everywhere it costs 1 % of error on evenly noisy meshes; so the scan's noise stands where the two agree to
     CLEARLY[0], and the place's own where they differ by more than CLEARLY[1].
     """
-    here = np.maximum((mean2 / np.maximum(1 - own, 0.2) ** 2).min(axis=1, keepdims=True), LEAST_NOISE)
+    here = np.maximum((mean2 / np.maximum(1 - own, 0.2) ** 2).min(axis=0), LEAST_NOISE)
     away = np.log(here / noise2)
     low, high = np.log(CLEARLY)
     return noise2 * np.exp(away * np.clip((np.abs(away) - low) / (high - low), 0, 1))

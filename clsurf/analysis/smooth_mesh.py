@@ -179,7 +179,7 @@ def guided(net: Net, guide_sharps: tuple, sharp: float) -> Guided:
     """Return the net's faces and vertices with normals filtered by `guide_sharps`."""
     rows, areas = guide_rows(net, guide_sharps)
     degree = np.maximum(np.diff(net.averaging.indptr), 1).astype(np.float32)
-    area = net.rings.means((net.averaging @ areas / degree)[:, None], AREA_ROUNDS)[:, 0]
+    area = net.rings.means((net.averaging @ areas / degree)[None], AREA_ROUNDS)[0]
     spacing = edge_length(np.maximum(area, 1e-14))
     samples = samples_of(net, rows, net.at_faces(spacing))
     normals = net.averaging @ net.device.download(rows, copy=False)[:, :3]
