@@ -1,5 +1,5 @@
-// Lay the ink of `draw_strokes` over a picture (linear, premultiplied), in the colours of the palette (linear, opaque), and
-// write the ink as a channel, 0 to 1. One work-item per SPAN pixels. Twin: tests/reference/lines.py.
+// Lay the ink of `draw_strokes` over a picture (linear, premultiplied), in the colours of the palette (linear, opaque),
+// and write the ink as a channel, 0 to 1. One work-item per SPAN pixels. Twin: tests/reference/lines.py.
 #ifndef SPAN
 #define SPAN 256
 #endif

@@ -1,6 +1,7 @@
 // Where the surface seen ends between two neighbouring pixels, in front of another or of the background: bytes as those
 // of `line_edges`, 0 before. A jump to a fringe, a last pixel of the farther surface that no other follows, does not
-// count: normals and depths of such pixels at contours are wrong by more than jumps are. One work-item per VW pixels. Twin: tests/reference/lines.py.
+// count: normals and depths of such pixels at contours are wrong by more than jumps are. One work-item per VW pixels.
+// Twin: tests/reference/lines.py.
 #include "analysis/line_planes.clh"
 enum { EDGE_RIGHT = 1, EDGE_DOWN = 2 };
 

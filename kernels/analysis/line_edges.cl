@@ -4,9 +4,9 @@
 //
 // AXIS 1: the field is a derivative along the direction t, whose sign means nothing: t of the second pixel is turned to
 // that of the first. Zeros count where the curvature that it is the derivative of has a maximum (EXTREMUM 1: the field
-// falls along t) or a minimum (-1), and changes at all: where it is constant, as on cylinders and tori, its derivative is
-// rounding. Its second derivative must be FLATTEST times its cube.
-// `values` are the planes of `line_values`. One work-item per VW pixels. Twin: tests/reference/lines.py.
+// falls along t) or a minimum (-1), and changes at all: where it is constant, as on cylinders and tori, its derivative
+// is rounding. Its second derivative must be FLATTEST times its cube. `values` are the planes of `line_values`. One
+// work-item per VW pixels. Twin: tests/reference/lines.py.
 #include "analysis/line_planes.clh"
 #ifndef AXIS
 #define AXIS 0
@@ -29,8 +29,8 @@ INLINE void place(__global const float *camera, VF x, VF y, VF depth, VF *p) {
 
 // The edges from the pixels at `at`, column px and row py, to those at `at + step`, `dx` columns and `dy` rows on.
 INLINE VI edges(__global const float *camera, __global const float *depths, __global const float *field,
-                __global const float *strength, __global const float *values, int plane, size_t at, int step, VF px, VF py,
-                float dx, float dy, float least) {
+                __global const float *strength, __global const float *values, int plane, size_t at, int step, VF px,
+                VF py, float dx, float dy, float least) {
   VF a = LOAD(field + at), b = LOAD(field + at + step);
   VI good = (a == a) & (b == b);
 #if AXIS

@@ -1,8 +1,8 @@
 // Which neighbouring pixels show one continuous surface: a plane of bits (HIT, LINK_RIGHT, LINK_DOWN).
 //
-// Two pixels are linked unless their depths differ by more than their slopes explain: by LIMIT footprints and SLACK times
-// the mean slope. A plain limit on the difference would cut smooth surfaces that turn away from the eye.
-// One work-item per VW pixels of the padded planes. Twin: tests/reference/lines.py.
+// Two pixels are linked unless their depths differ by more than their slopes explain: by LIMIT footprints and SLACK
+// times the mean slope. A plain limit on the difference would cut smooth surfaces that turn away from the eye. One
+// work-item per VW pixels of the padded planes. Twin: tests/reference/lines.py.
 #include "analysis/line_planes.clh"
 #ifndef LIMIT
 #define LIMIT 6.0f

@@ -1,11 +1,10 @@
 // The points of lines on the edges between pixels that they cross: x, y (pixels, centres at +0.5), depth and strength.
 //
 // CONTOUR 0: where the field, linear along the edge, is 0. CONTOUR 1: where the nearer surface ends. The squared cosine
-// between normal and ray falls linearly towards an occluding contour, so its zero is extrapolated from the last pixel of
-// the surface and the one before it; at open borders, where it does not reach 0, the edge's middle is taken. Strength: 2
-// before the background, 1 before another surface.
-// Edges are numbered 2 * pixel, + 1 for the one downwards, in rows of stride - 2 MARGIN_X pixels. One work-item per edge.
-// Twin: tests/reference/lines.py.
+// between normal and ray falls linearly towards an occluding contour, so its zero is extrapolated from the last pixel
+// of the surface and the one before it; at open borders, where it does not reach 0, the edge's middle is taken.
+// Strength: 2 before the background, 1 before another surface. Edges are numbered 2 * pixel, + 1 for the one downwards,
+// in rows of stride - 2 MARGIN_X pixels. One work-item per edge. Twin: tests/reference/lines.py.
 #define VW 1
 #include "analysis/line_planes.clh"
 #ifndef AXIS

@@ -1,6 +1,6 @@
-// The geometry of a picture for feature lines: planes of depth (NaN: nothing hit), of the depth's slopes to the right and
-// downwards as the normals tell them (in pixel footprints a pixel, so that 1 is 45 degrees), and of the squared sine
-// between normal and ray. One work-item per VW pixels of the padded planes. Twin: tests/reference/lines.py.
+// The geometry of a picture for feature lines: planes of depth (NaN: nothing hit), of the depth's slopes to the right
+// and downwards as the normals tell them (in pixel footprints a pixel, so that 1 is 45 degrees), and of the squared
+// sine between normal and ray. One work-item per VW pixels of the padded planes. Twin: tests/reference/lines.py.
 #include "analysis/line_planes.clh"
 #define STEEPEST 100.0f
 

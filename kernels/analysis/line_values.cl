@@ -1,11 +1,11 @@
 // What a kind of line is found in, as planes: a field whose zeros are the lines, and a strength.
 //
-// AXIS 0: field and strength are scalars, both times the squared sine between normal and ray where SINES is 1: the radial
-// curvature has no value where the eye looks along the normal, its product with that factor is smooth there.
-// The strength is `sign` times a channel, or its size where `sign` is 0; OTHER 1: 0 where another channel is larger in size.
-// AXIS 1: the derivative of a curvature along its principal direction t changes its sign with that of t, which means
-// nothing; the vector derivative * t does not. Planes: that vector (3), the strength, and t (3).
-// One work-item per VW pixels of the padded planes. Twin: tests/reference/lines.py.
+// AXIS 0: field and strength are scalars, both times the squared sine between normal and ray where SINES is 1: the
+// radial curvature has no value where the eye looks along the normal, its product with that factor is smooth there. The
+// strength is `sign` times a channel, or its size where `sign` is 0; OTHER 1: 0 where another channel is larger in
+// size. AXIS 1: the derivative of a curvature along its principal direction t changes its sign with that of t, which
+// means nothing; the vector derivative * t does not. Planes: that vector (3), the strength, and t (3). One work-item
+// per VW pixels of the padded planes. Twin: tests/reference/lines.py.
 #include "analysis/line_planes.clh"
 #ifndef AXIS
 #define AXIS 0

@@ -1,6 +1,6 @@
-// Smooth the planes of `line_values` by a Gaussian that does not reach across depth jumps: along rows, then along columns,
-// each window ending at the first missing link. Writes planes of the field and the strength; the field is NaN within CLEAR
-// pixels of a jump or of the background, where neither curvatures nor their derivatives are to be trusted.
+// Smooth the planes of `line_values` by a Gaussian that does not reach across depth jumps: along rows, then along
+// columns, each window ending at the first missing link. Writes planes of the field and the strength; the field is NaN
+// within CLEAR pixels of a jump or of the background, where neither curvatures nor their derivatives are to be trusted.
 //
 // One work-item per VW columns and ROWS rows, with the last 2 RADIUS + 1 smoothed rows in a ring.
 // Twin: tests/reference/lines.py.
@@ -41,8 +41,8 @@ INLINE VI smooth_row(__global const float *values, __global const int *links, si
 }
 
 // Smooth along a column and write one row; `value` and `bits` are rings, row y at slot (y + RING) % RING.
-INLINE void smooth_column(VF value[RING][COUNT], VI bits[RING], int y, __global const float *weights, size_t to, int plane,
-                          __global const float *values, __global float *field, __global float *strength) {
+INLINE void smooth_column(VF value[RING][COUNT], VI bits[RING], int y, __global const float *weights, size_t to,
+                          int plane, __global const float *values, __global float *field, __global float *strength) {
   int own = (y + RING) % RING;
   VI down = (bits[own] & HIT) != 0, up = down, clear = (bits[own] & CLEAR_ROW) != 0;
   VF sum = (VF)(weights[0]), total[COUNT];
@@ -82,7 +82,8 @@ __kernel void smooth_lines(int height, int stride, int plane, __global const int
     int slot = (y + RING) % RING, middle = y - RADIUS;
     size_t at = PLANE_AT(x, y);
     // Rows without a hit keep old values, which the missing links leave unused.
-    if (inside && any_lane((LOAD_INT(links + at) & HIT) != 0)) bits[slot] = smooth_row(values, links, at, plane, weights, value[slot]);
+    if (inside && any_lane((LOAD_INT(links + at) & HIT) != 0))
+      bits[slot] = smooth_row(values, links, at, plane, weights, value[slot]);
     else bits[slot] = (VI)(0);
     if (middle < first) { }
     else if (any_lane((bits[(middle + RING) % RING] & HIT) != 0))
