@@ -59,11 +59,16 @@ def test_shadow_of_a_sphere_on_a_plane(device, light, lanes):
     assert np.array_equal(dark[clear], (passing < RADIUS)[clear])
 
 
+@pytest.mark.parametrize("oriented", (True, False))
 @pytest.mark.parametrize("lanes", FORMS)
-def test_a_sphere_does_not_shadow_itself(device, lanes):
-    """A convex surface is lit wherever it faces the lamp."""
-    light = Light("directional", (1.0, -0.6, 0.5))
-    frame = picture(device, [light], lanes=lanes, surfaces=[sphere(900)])
+def test_a_sphere_does_not_shadow_itself(device, lanes, oriented):
+    """A convex surface is lit wherever it faces the lamp, also where the signs of its normals are random."""
+    light, surface = Light("directional", (1.0, -0.6, 0.5)), sphere(900)
+    if not oriented:
+        flip = np.where(np.random.default_rng(0).uniform(size=(900, 1)) < 0.5, -1.0, 1.0)
+        surface = leaves(surface.centers, surface.radii, surface.normals * flip, surface.coefficients * flip, 2,
+                         oriented=False)
+    frame = picture(device, [light], lanes=lanes, surfaces=[surface])
     hit = frame.id == 0
     cosine = frame.normal[hit].astype(float) @ np.array(light.vector) / np.linalg.norm(light.vector)
     lit = frame.color[hit][:, 0]

@@ -12,6 +12,7 @@ from clsurf.render.camera import Camera
 from clsurf.render.renderer import Renderer
 from clsurf.render.slim import place_slim, upload_slim
 from clsurf.render.tiles import Layout
+from clsurf.trace.hits import trace
 from clsurf.trace.packets import trace_pixels
 from clsurf.trace.slim import upload_traced
 
@@ -137,3 +138,14 @@ def test_both_forms_see_the_same(device):
     one, two = (traced_picture(device, surface, cameras()[1], SIZE, lanes)[0] for lanes in FORMS)
     both = np.isfinite(one) & np.isfinite(two)
     assert (np.isfinite(one) == np.isfinite(two)).all() and np.abs(one[both] - two[both]).max() < 1e-5
+
+
+def test_packets_and_single_rays_hit_the_same(device):
+    surface, camera = fitted(*torus_points(3000), 0.2), cameras()[0]
+    depth, _, _ = traced_picture(device, surface, camera, SIZE, 16)
+    origins, directions = camera.rays(SIZE)
+    hits = trace(surface, origins, directions, device=device)
+    along = (hits.distance * (directions @ -camera.rotation[2])).reshape(depth.shape)
+    both = np.isfinite(depth) & np.isfinite(along)
+    assert both.sum() > 500 and (np.isfinite(depth) == np.isfinite(along)).mean() >= 0.999
+    assert (np.abs(depth[both] - along[both]) < 1e-5).mean() >= 0.998

@@ -23,7 +23,7 @@ enum { HEADLIGHT, DIRECTIONAL, POINT };
 #define TILE_BINS 4
 #endif
 #ifndef OFFSET_RADII
-#define OFFSET_RADII 0.25f
+#define OFFSET_RADII (ORIENTED ? 0.25f : 1.0f)  // where sides mean nothing, a point's own surfels are hit from behind too
 #endif
 #ifndef GRAZING_RADII
 #define GRAZING_RADII 0.04f  // error of a surfel's height: at the angle whose cosine is c it shifts a hit by this over c
