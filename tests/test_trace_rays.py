@@ -10,6 +10,8 @@ from clsurf.errors import Cancelled, InputError
 from clsurf.render.renderer import Renderer
 from clsurf.surface.placed import placed
 from clsurf.trace import hits as hits_module
+from clsurf.trace.ray_slim import neighbour_lists
+from clsurf.trace.tree import node_boxes, plant
 
 
 def sphere_mesh(rings=24, segments=48, radius=1.0):
@@ -116,7 +118,8 @@ def test_ray_triangles(device, lanes):
         mine = slice(*found.offsets[i:i + 2])
         np.testing.assert_allclose(found.distance[mine], distance, rtol=2e-6)
         assert (found.primitive[mine] == face).all()
-        assert closest.distance[i] == (found.distance[mine][0] if len(distance) else np.inf)
+        first = found.distance[mine][0] if len(distance) else np.inf
+        np.testing.assert_allclose(closest.distance[i], first, rtol=1e-12)
         assert some.hit[i] == (len(distance) > 0) and (not some.hit[i] or some.primitive[i] in face)
     assert (np.diff(found.offsets) > 1).any() and found.hit.sum() == closest.hit.sum()
 
@@ -142,6 +145,23 @@ def test_ray_slim(device, lanes, degree, oriented):
         same += close and hits.normal[i] @ (normal if normal @ directions[i] < 0 else -normal) > 0.9999
     assert same >= len(origins) - 2  # a hit on a ball's rim is decided by rounding
     assert 100 < hits.hit.sum() < 150
+
+
+def test_neighbour_lists():
+    """Every bottom node lists those whose balls reach into its pieces, once each; empty and small trees too."""
+    rng = np.random.default_rng(13)
+    for count in (1, 16, 17, 700):
+        center, half = rng.uniform(-1, 1, (count, 3)), rng.uniform(0, 0.1, (count, 1))
+        tree = plant(center - half, center + half)
+        boxes, balls = (node_boxes(tree, center - f * half, center + f * half) for f in (1, 2))
+        first, near_boxes, near_nodes = neighbour_lists(tree, boxes, balls)
+        pieces, whole = boxes[tree.first_bottom:], balls[tree.first_bottom:]
+        low, high = pieces[:, :3].min(axis=2), pieces[:, 3:].max(axis=2)
+        least, most = whole[:, :3].min(axis=2), whole[:, 3:].max(axis=2)
+        for i in range(len(pieces)):
+            wanted = np.flatnonzero((least <= high[i]).all(axis=1) & (most >= low[i]).all(axis=1))
+            used = near_boxes[first[i]:first[i + 1], 0] < 1e29
+            np.testing.assert_array_equal(np.sort(near_nodes[first[i]:first[i + 1]][used]), wanted)
 
 
 # Leaks ---------------------------------------------------------------------------------------------------------------

@@ -113,10 +113,10 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
     tracer = _All(opened, rays) if query == "all" else _Nearest(opened, rays, QUERIES[query])
     for start in range(0, rays.count, SLAB):
         stop = min(start + SLAB, rays.count)
-        tracer.open(start, stop)
+        tracer.open(start, stop, empty=not parts)
         for first in range(start, stop, CHUNK):
-            for number, held, place in parts:
-                tracer.run(number, held, place, first, min(CHUNK, stop - first))
+            for i, (number, held, place) in enumerate(parts):
+                tracer.run(number, held, place, first, min(CHUNK, stop - first), fresh=i == 0)
             if progress is not None and progress("trace", min(first + CHUNK, stop) / rays.count) is False:
                 raise Cancelled("trace: stopped")
         tracer.close(start, stop)
@@ -193,8 +193,11 @@ class _Nearest:
         self.doubles = has_doubles(device)
         self.done: list[tuple] = []
 
-    def open(self, start: int, stop: int) -> None:
-        """Make room for the hits of rays `start` to `stop`, and put the rays there where the device has float64."""
+    def open(self, start: int, stop: int, empty: bool) -> None:
+        """Make room for the hits of rays `start` to `stop`, and put the rays there where the device has float64.
+
+        `empty`: no surface will be traced, so that nothing but this fills the room.
+        """
         count, device = stop - start, self.device
         chunk = min(CHUNK, count)
         if self.doubles:
@@ -213,23 +216,24 @@ class _Nearest:
         if self.doubles:
             self.out = tuple(device.empty(*shape) for shape in shapes)
             for array, value in zip(self.out, (np.inf, np.nan, np.nan, -1, -1), strict=True):
-                device.fill(array, value)
+                if empty:
+                    device.fill(array, value)
         else:
             self.out = tuple(np.full(shape, value, dtype) for (shape, dtype), value
                              in zip(shapes, (np.inf, np.nan, np.nan, -1, -1), strict=True))
 
-    def run(self, number: int, held, place: NDArray, first: int, count: int) -> None:
-        """Trace `count` rays from ray `first` on against one surface."""
+    def run(self, number: int, held, place: NDArray, first: int, count: int, fresh: bool) -> None:
+        """Trace `count` rays from ray `first` on against one surface; `fresh`: it is the first one."""
         device, at = self.device, first - self.start
         rays, hits = self.on_device
         if not self.doubles:
             return self._run_host(number, held, place, first, count)
         on_device = device.upload(place)
-        device.kernel("trace/start_rays.cl")((count,), (64,), count, at, *self.arguments, self.out[0], 1, on_device,
-                                             device.upload(held.box.ravel()), rays, self.starts)
+        device.kernel("trace/start_rays.cl")((count,), (64,), count, at, *self.arguments, self.out[0], int(not fresh),
+                                             on_device, device.upload(held.box.ravel()), rays, self.starts)
         held.launch(self.mode, count, rays, hits)
         device.kernel("trace/finish_rays.cl")((count,), (64,), count, at, *self.arguments[:4], on_device, self.starts,
-                                              hits, number, *self.out)
+                                              hits, number, int(fresh), *self.out)
         return None
 
     def _run_host(self, number, held, place, first, count) -> None:
@@ -271,10 +275,10 @@ class _All:
         self.device, self.rays = device, rays
         self.found: list[tuple] = []  # ray, distance, position, normal, surface, primitive
 
-    def open(self, start: int, stop: int) -> None:
+    def open(self, start: int, stop: int, empty: bool) -> None:
         """Nothing is prepared."""
 
-    def run(self, number: int, held, place: NDArray, first: int, count: int) -> None:
+    def run(self, number: int, held, place: NDArray, first: int, count: int, fresh: bool) -> None:
         """Trace `count` rays from ray `first` on against one surface."""
         device = self.device
         device.check_memory(frame=4 * (RAY_FLOATS + HIT_FLOATS) * count)

@@ -1,12 +1,12 @@
-// Single rays against a SLIM surface, by the rules of the tile renderer (kernels/render/tile_slim.cl): the frontmost hit
-// of the balls shrunk by ALPHA, then the blend of all surfels whose ball holds that point; where its weights add up to
-// less than SUPPORT, the ray looks behind it, up to TRIES times, and keeps the last hit. One work-item traces `batch`
-// rays: with 16 lanes in turns (ray_batch.clh), otherwise one after the other. Twin: tests/reference/trace_rays.py,
-// ray_slim.
+// Single rays against a SLIM surface, by the rules of the tile renderer (kernels/render/tile_slim.cl): the frontmost
+// hit of the balls shrunk by ALPHA, then the blend of all surfels whose ball holds that point; where its weights add up
+// to less than SUPPORT, the ray looks behind it, up to TRIES times, and keeps the last hit. One work-item traces
+// `batch` rays: with 16 lanes in turns (ray_batch.clh), otherwise one after the other. Twin:
+// tests/reference/trace_rays.py, ray_slim.
 //
-// A bottom node has a block of FIELDS vectors of 16 floats, one lane for each slot, and a list of the bottom nodes whose
-// balls reach into its piece of surface: groups near_first[bottom] to near_first[bottom + 1] - 1, each 16 boxes of balls
-// as a node has them, and the 16 bottom nodes (clsurf/trace/ray_slim.py).
+// A bottom node has a block of FIELDS vectors of 16 floats, one lane for each slot, and a list of the bottom nodes
+// whose balls reach into its piece of surface: groups near_first[bottom] to near_first[bottom + 1] - 1, each 16 boxes
+// of balls as a node has them, and the 16 bottom nodes (clsurf/trace/ray_slim.py).
 #include "common/slim.clh"
 #include "trace/ray_walk.clh"
 
@@ -39,7 +39,8 @@ typedef struct { VF u, v, w; } Spot;
 
 INLINE VF signed_by(VF x, VI sign) { return AS_VF(AS_VI(x) ^ sign); }
 
-// A vector in the frames of the surfels, by the algebra of common/frame.clh: u = (1 + s x^2 a, s x y a, -s x) and so on.
+// A vector in the frames of the surfels, by the algebra of common/frame.clh: u = (1 + s x^2 a, s x y a, -s x) and so
+// on.
 INLINE Spot turned(__global const float *k, VF x, VF y, VF z) {
   VI sign = AS_VI(FIELD(N_Z)) & (VI)0x80000000;
   VF m = FIELD(N_X) * x + FIELD(N_Y) * y, h = FIELD(TURN) * m - z;

@@ -1,7 +1,8 @@
 // Single rays against triangles, without leaks: Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1),
-// 2013. A ray that meets an edge or a vertex exactly is thought moved aside by (e, e^2), e -> 0, in the plane across it, so
-// that it crosses exactly one of the triangles that share an edge, and closed meshes an even number of times. One
-// work-item traces `batch` rays: with 16 lanes in turns (ray_batch.clh), otherwise one after the other. Twin: tests/reference/trace_rays.py, ray_triangles.
+// 2013. A ray that meets an edge or a vertex exactly is thought moved aside by (e, e^2), e -> 0, in the plane across
+// it, so that it crosses exactly one of the triangles that share an edge, and closed meshes an even number of times.
+// One work-item traces `batch` rays: with 16 lanes in turns (ray_batch.clh), otherwise one after the other. Twin:
+// tests/reference/trace_rays.py, ray_triangles.
 //
 // A bottom node has a block of 9 vectors of 16 floats: the corners A, B, C of the triangle in each slot, x, y, z each.
 #include "trace/ray_walk.clh"
@@ -25,8 +26,8 @@ INLINE Shear shear_of(const Ray *r) {
   return s;
 }
 
-// 1 or -1: the side of the ray that the edge from p to q passes on; 0 for an edge of no length. The products are compared,
-// not subtracted: rounding keeps their order, so an edge has opposite signs from its two ends.
+// 1 or -1: the side of the ray that the edge from p to q passes on; 0 for an edge of no length. The products are
+// compared, not subtracted: rounding keeps their order, so an edge has opposite signs from its two ends.
 INLINE VF edge_side(VF px, VF py, VF qx, VF qy) {
   VF a = qx * py, b = qy * px;
   VF zero = 0.0f, one = 1.0f;
@@ -53,7 +54,8 @@ typedef __global const float *Model;
 INLINE VF lesser(VF a, VF b) { return VMIN(a, b); }
 INLINE VF greater(VF a, VF b) { return VMAX(a, b); }
 
-// Take the triangle of a bottom node that the ray meets first, in front of found->key; of equals that in the first slot.
+// Take the triangle of a bottom node that the ray meets first, in front of found->key; of equals that in the first
+// slot.
 INLINE void leaf_hit(const Ray *r, const Goal *goal, Model blocks, int bottom, Found *found) {
   Shear s = shear_of(r);
   for (int part = 0; part < WIDE; part += VW) {

@@ -1,5 +1,5 @@
-// Rays of the world in the frame of a traced surface: unit directions, clipped to the surface's box, so that float32 holds
-// what is left. Twin: clsurf.trace.single.start_rays_host, which devices without float64 use.
+// Rays of the world in the frame of a traced surface: unit directions, clipped to the surface's box, so that float32
+// holds what is left. Twin: clsurf.trace.single.start_rays_host, which devices without float64 use.
 //
 // `place`: 12 numbers, row by row the affine map of the world to the frame; the length of one unit of the frame in the
 // world. `box`: least and largest x, y, z. Steps are 0 where one vector or limit serves all rays.
@@ -11,7 +11,7 @@ inline void clip(double o, double d, double least, double largest, double *near,
     if (!(o >= least && o <= largest)) *far = -1.0;
     return;
   }
-  double a = (least - o) / d, b = (largest - o) / d;
+  double inverse = 1.0 / d, a = (least - o) * inverse, b = (largest - o) * inverse;
   double enters = a < b ? a : b, leaves = a < b ? b : a;
   *near = enters > *near ? enters : *near;
   *far = leaves < *far ? leaves : *far;
@@ -30,7 +30,8 @@ __kernel void start_rays(int count, long first, __global const double *origins, 
   double most = x < 0.0 ? -x : x;
   most = y > most ? y : -y > most ? -y : most;
   most = z > most ? z : -z > most ? -z : most;
-  x /= most; y /= most; z /= most;  // its square may not be a number
+  double part = most < 1e-100 ? 1e200 : most > 1e100 ? 1e-200 : 1.0;  // so that squares stay numbers
+  x *= part; y *= part; z *= part;
   double inverse = 1.0 / sqrt(x * x + y * y + z * z), scale = place[12];
   x *= inverse * scale; y *= inverse * scale; z *= inverse * scale;
   double dx = place[0] * x + place[1] * y + place[2] * z, dy = place[4] * x + place[5] * y + place[6] * z;
