@@ -123,6 +123,12 @@ def _closed(f) -> str:
             f"{sphere['pinholes']} / {found['earth 1128']['pinholes']}, specks {specks[0]} / {specks[1]}")
 
 
+def _curvature(f) -> str:
+    found = f["curvature"]
+    return ", ".join(f"{found[kind]['0.0']['rms']:.1e} / {found[kind]['0.001']['rms']:.4f} ({kind})"
+                     for kind in ("torus", "mesh"))
+
+
 ROWS = (
     Row("dragon build, 435K points with normals, T 0.01, quadratic, links included", "PoCL 1.0 s, Intel 0.7 s",
         "0.4 s", _s("build", "dragon", "build", "median_s")),
@@ -169,6 +175,9 @@ ROWS = (
     Row("against VTK's software rendering of the same nodes as a mesh", "40x", "100x", _vtk),
     Row("perfect sphere at 1920x1080, 4 views: pixels more than 0.02 off its depth where seen at up to 70 degrees "
         "(largest), and of it / Earth 1128: pinholes, isolated pixels", "0", "", _closed),
+    Row("mean curvature of a torus of 51,200 points, relative RMS exact / with 0.1 % noise, nothing set by hand",
+        "0.0005 / 0.025", "0.00005 / 0.02", _curvature),
+    Row("its time per 100K points, exact", "0.4 s", "0.1 s", _s("curvature", "torus", "0.0", "median_s")),
 )
 
 
