@@ -16,7 +16,7 @@ CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np
             "id": (0, np.int32), "count": (0, np.int32), "level": (0, np.int32), "cost": (0, np.int32)}
 KINDS = {"headlight": 0, "directional": 1, "point": 2}
 LOOKS = ("phong", "flat", "reflection", "ball_size", "ball_level")
-STREAMED_BYTES = 24 << 20  # pictures larger than this are stored past the caches
+STREAMED_BYTES = 8 << 20  # pictures larger than this are stored past the caches
 SPAN = 128  # pixels of a row of bins that one work-item shades
 
 
