@@ -261,6 +261,28 @@ def test_options_out_of_range(options, device):
         curvature(clsurf.models.sphere(100), device=device, **options)
 
 
+@pytest.mark.parametrize("radius", [1e-6, 1e6])
+def test_a_radius_without_a_surface_is_refused(radius, device):
+    points, normals, _, _ = curved.sphere(2000)
+    with pytest.raises(InputError, match="the spacing is 0"):
+        curvature(cloud_of(points, normals), radius=radius, device=device)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_extreme_scales(scale, device):
+    points, normals, _, _ = curved.sphere(1000, 1.0)
+    found = curvature(PointCloud((points * scale).astype(np.float32), normals.astype(np.float32)), device=device)
+    np.testing.assert_allclose(found.mean * scale, 1, atol=0.01)
+
+
+def test_far_strays(device):
+    points, normals, _, _ = curved.sphere(1000, 1.0)
+    points = np.concatenate([points, [[1e8, 0, 0]]]).astype(np.float32)
+    found = curvature(cloud_of(points, np.concatenate([normals, [[0, 0, 1]]])), device=device)
+    np.testing.assert_allclose(found.mean[:-1], 1, atol=0.01)
+    assert np.isnan(found.mean[-1])
+
+
 def test_points_on_a_line_do_not_fail(device):
     line = np.linspace(0, 1, 40)[:, None] * (1.0, 2.0, 3.0)
     found = curvature(PointCloud(line), device=device)

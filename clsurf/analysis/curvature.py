@@ -204,6 +204,9 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
     tree = plan.tree
     report("surfels", 0.0)
     surfels = fit_surfels(tree, plan.block_radius, plan.noise, plan.spacing)
+    if radius != "auto" and not (device.download(surfels.balls, copy=False)[3] > 0).any():
+        raise InputError(f"radius: expected balls that hold a piece of the surface, got {radius:g}: the spacing is "
+                         f"{plan.spacing * unit:.3g}, the diagonal {diagonal:.3g}: take 'auto'")
     report("surfels", 1.0)
     world_middle = middle + scan.origin
     if points is not None:
