@@ -16,6 +16,7 @@ from pathlib import Path
 from clsurf.errors import Error
 
 from . import JOBS, record, run
+from .smooth import GOALS
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,13 @@ def _curvature(f) -> str:
                      for kind in ("torus", "mesh"))
 
 
+def _smooth(scene):
+    def text(figures) -> str:
+        found = figures["smooth"][scene]["normals"]
+        return f"{found['surface']:.4f} % / {found['vertex_normal']:.2f} degrees"
+    return text
+
+
 ROWS = (
     Row("dragon build, 435K points with normals, T 0.01, quadratic, links included", "PoCL 1.0 s, Intel 0.7 s",
         "0.4 s", _s("build", "dragon", "build", "median_s")),
@@ -178,6 +186,10 @@ ROWS = (
     Row("mean curvature of a torus of 51,200 points, relative RMS exact / with 0.1 % noise, nothing set by hand",
         "0.0005 / 0.025", "0.00005 / 0.02", _curvature),
     Row("its time per 100K points, exact", "0.4 s", "0.1 s", _s("curvature", "torus", "0.0", "median_s")),
+    *(Row(f"smoothing of {scene}, distance from the true surface (root mean square of the diagonal) / vertex normals "
+          "(mean)", f"{floor[0]:.3f} % / {floor[1]:.1f}", f"{aim[0]:.3f} % / {aim[1]:.1f}", _smooth(scene))
+      for scene, (floor, aim) in GOALS.items()),
+    Row("smoothing the bunny", "0.3 s", "0.15 s", _s("smooth", "bunny + 0.2 %", "seconds")),
 )
 
 
