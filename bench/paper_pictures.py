@@ -10,7 +10,7 @@ Also `--only NAME ...` for some of them, `--strip FILE` for README's strip of sm
 | curvature | 12, 16: curvature by degree |
 | sides | 14-16: both sides of equation 8 |
 | suggestive, crest | 11, 13: suggestive contours; crest lines, ridges and valleys |
-| shadows | 18: two lights with shadows; ambient occlusion |
+| shadows | 18: two lights with shadows, mirror reflection; ambient occlusion |
 | smoothing | 19, 20: before and after |
 """
 
@@ -29,7 +29,7 @@ from . import scenes, views
 from .sparsity import linear_of_floats
 
 SIZE = (1024, 1024)
-FINE, COARSE = 0.005, 0.02  # T_MDL of what is shown and of what lines are found on
+FINE = 0.005  # T_MDL of what is shown
 DIRECTIONS = {"bunny": views.direction(20, 15), "dragon": views.direction(20, 15)}
 STRIP_HEIGHT = 260  # pixels
 
@@ -40,6 +40,8 @@ class Pictures:
     def __init__(self, device):
         self.device = device
         self.surface = functools.lru_cache(maxsize=None)(self._surface)
+        self.line_surface = functools.lru_cache(maxsize=None)(
+            lambda name: clsurf.line_surface(scenes.scene(name).scan, device=device))
 
     def _surface(self, name: str, degree: int = 2, t_mdl: float = FINE):
         return clsurf.build_slim(scenes.scene(name).scan, degree=degree, error=t_mdl, device=self.device)
@@ -121,7 +123,7 @@ class Pictures:
 
     def _lined(self, name, kinds, on=None):
         camera = self.camera(name)
-        coarse = self.draw(self.surface(name, 3, COARSE), camera, channels=clsurf.line_channels(kinds), lod=0)
+        coarse = self.draw(self.line_surface(name), camera, channels=clsurf.line_channels(kinds), lod=0)
         fine = self.draw(self.surface(name, 2, FINE), camera, channels=("color", "depth", "normal"),
                          **({} if on is None else {"shading": on}))
         found = clsurf.lines(coarse, ("contours", *kinds), silhouette=fine, device=self.device)
@@ -140,7 +142,7 @@ class Pictures:
                 for name in ("bunny", "dragon") for kinds, on in ((("crest",), None), (("ridges", "valleys"), pale))}
 
     def shadows(self) -> dict:
-        """Figure 18: two lights with hard shadows; ambient occlusion."""
+        """Figure 18: two lights with hard shadows, with and without a mirrored share; ambient occlusion."""
         lights = [Light("directional", (-0.8, 1.2, 0.9), (0.75, 0.72, 0.66)),
                   Light("directional", (1.4, 0.7, 0.5), (0.35, 0.40, 0.48))]
         found = {}
@@ -148,6 +150,8 @@ class Pictures:
             scene = clsurf.Scene([self.surface(name, 3, 0.01)], lights=lights)
             found[f"shadows_{name}"] = self.draw(scene, self.camera(name), supersampling=2,
                                                  shading=clsurf.Shading(shadows=True))
+            found[f"mirror_{name}"] = self.draw(scene, self.camera(name), supersampling=2,
+                                                shading=clsurf.Shading(shadows=True, mirror=0.4))
             found[f"occlusion_{name}"] = self.draw(scene, self.camera(name), supersampling=2,
                                                    shading=clsurf.Shading(occlusion=128, ambient=0.8, diffuse=0.1))
         return found
