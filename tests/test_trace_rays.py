@@ -164,6 +164,20 @@ def test_neighbour_lists():
             np.testing.assert_array_equal(np.sort(near_nodes[first[i]:first[i + 1]][used]), wanted)
 
 
+def test_hits_without_support_are_looked_behind(device, lanes):
+    """The rim of a lone surfel lets rays through to a supported one; where that fails too, the last hit stays."""
+    surface = clsurf.SlimSurface(
+        2, 0.01, centers=[[0, 0, 1], [0.7, 0, 0]], radii=[1, 0.5], normals=[[0, 0, 1]] * 2,
+        coefficients=np.zeros((2, 6)), level=[1, 1], leaf=[True, True], child_offset=[0, 0, 0],
+        children=np.zeros(0, np.int32), fit_error=[0, 0])
+    places = np.array([[0.2, 0, 5], [0.7, 0, 5], [0.75, 0.35, 5]])  # support 0.88; 0.13, then 1; none, then 0.125
+    hits = clsurf.trace(surface, places, (0, 0, -1), device=device)
+    np.testing.assert_allclose(hits.distance, [4, 5, 5], atol=1e-5)
+    assert hits.primitive.tolist() == [0, 1, 1]
+    for place, distance in zip(places, hits.distance, strict=True):
+        assert abs(twin.ray_slim(twin.Leaves(surface), place, (0, 0, -1))[0] - distance) < 1e-5
+
+
 # Leaks ---------------------------------------------------------------------------------------------------------------
 
 
