@@ -26,6 +26,11 @@ def ball(tmp_path):
     return path
 
 
+def test_help(capsys):
+    assert main(["curvature", "--help"]) == 0
+    assert "Usage" in capsys.readouterr().out
+
+
 def test_ranges_are_printed(ball, on_device, capsys):
     assert main(["curvature", str(ball)]) == 0
     out, err = capsys.readouterr()
