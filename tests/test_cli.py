@@ -13,7 +13,8 @@ import clsurf
 from clsurf.cli import main
 from clsurf.cli.common import parsed_size
 
-COMMANDS = ["demo", "devices", "doctor", "info", "build", "convert", "render", "report", "bench"]
+COMMANDS = ["demo", "devices", "doctor", "info", "build", "convert", "render", "trace", "curvature", "smooth", "report",
+            "bench"]
 
 
 @pytest.fixture

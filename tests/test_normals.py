@@ -134,7 +134,8 @@ def test_normals_do_not_depend_on_the_order_or_the_kernel_form(device, monkeypat
 DEGENERATE = {"none": np.zeros((0, 3)), "one": np.ones((1, 3)), "two": [[0, 0, 0], [1e-12, 0, 0]], "three": np.eye(3),
               "same": np.ones((3000, 3)), "line": np.arange(500.0)[:, None] * [1, 2, 3], "axis": np.eye(3)[[0] * 9] * 5,
               "far": RNG.random((500, 3)) + 1e9, "huge": RNG.random((500, 3)) * 1e30,
-              "tiny": RNG.random((500, 3)) * 1e-30, "apart": np.concatenate([RNG.random((99, 3)), 1e9 + np.eye(3)])}
+              "tiny": RNG.random((500, 3)) * 1e-30, "apart": np.concatenate([RNG.random((99, 3)), 1e9 + np.eye(3)]),
+              "stray": np.concatenate([RNG.random((2000, 3)), [[1e20, 0, 0]]])}
 
 
 @pytest.mark.parametrize("name", DEGENERATE)

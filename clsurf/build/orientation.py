@@ -28,6 +28,7 @@ NEIGHBOURS = 8  # nearest voxels that every voxel is compared with; 12 gained no
 OUTSIDE = 10.0
 PIXEL = 2.0  # of the pictures of the outside, over the voxel: surfaces are opaque in them
 CLEAR = 0.1  # share of votes below which the outside has not decided
+FARTHEST = 2.0**30  # cells or pixels along a side: strays beyond, 1e20 diagonals away, would overflow their numbers
 
 
 def oriented_to(normals, directions) -> NDArray:
@@ -86,8 +87,7 @@ def seen_from_outside(points, normals, pixel) -> tuple[NDArray, NDArray]:
         side = np.cross(direction, np.eye(3, dtype=np.float32)[np.argmin(np.abs(direction))])
         side /= np.linalg.norm(side)
         x, y = points @ side, points @ np.cross(direction, side)
-        column = ((x - x.min()) / pixel).astype(np.int64)
-        row = ((y - y.min()) / pixel).astype(np.int64)
+        column, row = (np.minimum((a - a.min()) / pixel, FARTHEST).astype(np.int64) for a in (x, y))
         key, pixels = column * (row.max() + 1) + row, (column.max() + 1) * (row.max() + 1)
         if pixels > 8 * len(points) + 1000:  # a sparse picture
             key = np.unique(key, return_inverse=True)[1]
@@ -241,7 +241,7 @@ def voxel_means(points, normals, size) -> tuple[NDArray, NDArray, NDArray]:
 def cell_numbers(points, size) -> tuple[NDArray, int]:
     """Return the number (n,) int64 of the cubic cell of side `size` of each point, and how many cells are in use."""
     low, high = bounds(points)
-    cells = np.floor((points - low) * np.float32(1 / size)).astype(np.int64)
+    cells = np.minimum((points - low) * np.float32(1 / size), FARTHEST).astype(np.int64)
     spans = np.floor((high.astype(np.float64) - low) / size) + 2
     index_bits = len(points).bit_length()
     if spans.prod() >= 2.0 ** (63 - index_bits):  # a vast and sparse cloud
