@@ -3,6 +3,7 @@
 import numpy as np
 
 from clsurf.surface.slim import frame_of_normals
+
 from .render import (
     ALPHA,
     BACK_BIAS,
