@@ -1,8 +1,10 @@
 """The job `trace`: rays a second, by packets of a picture (primary, shadows, ambient occlusion) and one by one.
 
 Packets are timed as launches; single rays as `clsurf.trace` from host arrays of float64 to host arrays of float64, and
-beside it the share of the kernel itself. A shadow or occlusion ray is one that has to be traced: from a pixel that
-shows the surface and faces the lamp. Embree is Open3D's, on the mesh that the surface was made from, float32 both ways.
+beside it the share of the kernel itself: "single" are lines from around the model to random vertices, "bounced" rays
+leave the pixels of a picture in random directions. A shadow or occlusion ray is one that has to be traced: from a pixel
+that shows the surface and faces the lamp. Embree is Open3D's, on the mesh that the surface was made from, float32 both
+ways.
 """
 
 import time
@@ -45,9 +47,10 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
         found = {"primary": primary(name, surface, device, size, runs)}
         found |= secondary(scene, surface, device, size, frame, runs)
         found["single"] = single(scene, surface, device, count, runs, with_peer=not quick)
+        found["bounced"] = bounced(scene, surface, device, size, runs, with_peer=not quick)
         for what, values in found.items():
-            values["goals"] = SINGLE_GOALS["Intel" in device.platform_name] if (name, what) == ("dragon", "single") \
-                else GOALS.get((name, what))
+            values["goals"] = SINGLE_GOALS["Intel" in device.platform_name] \
+                if name == "dragon" and what in ("single", "bounced") else GOALS.get((name, what))
         figures[name] = found
     show(figures)
     if profile:
@@ -201,6 +204,47 @@ def single(scene, surface, device, count: int, runs: int, with_peer: bool) -> di
     return out
 
 
+def bounced(scene, surface, device, size, runs: int, with_peer: bool) -> dict:
+    """Return the figures of rays that leave the surface seen, one a pixel in the picture's order; and Embree's.
+
+    Raises
+    ------
+    WrongAnswer
+        Other rays hit the surface than hit the mesh.
+    """
+    origins, directions = bounced_rays(surface, device, size)
+    hit = clsurf.trace(surface, origins, directions, device=device).hit
+    differ = (hit != clsurf.trace(scene.scan, origins, directions, device=device).hit).mean()
+    if not differ < 0.1:  # bunny 0.5 %, dragon 0.3 %, a coarse torus 7 %
+        raise WrongAnswer(f"bench trace {scene.name}: expected bounced rays to hit the surface where they hit the "
+                          f"mesh, got {differ:.1%} that do not")
+    runners = {"closest": lambda: clsurf.trace(surface, origins, directions, device=device)}
+    embree = peers.embree(scene.scan) if with_peer else None
+    if embree is not None:
+        rays = embree.module.core.Tensor(np.concatenate([origins - embree.origin, directions], 1).astype(np.float32))
+        runners["embree"] = lambda: embree.scene.cast_rays(rays)
+    seconds = {name: [] for name in runners}
+    for _ in range(runs):
+        for name, run in runners.items():
+            start = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - start)
+    out = {name: {"time": record.timing(values), "mrays_s": len(origins) / np.median(values) / 1e6}
+           for name, values in seconds.items()}
+    return {"rays": len(origins), "hits": float(hit.mean()), "differ": float(differ),
+            "mrays_s": out["closest"]["mrays_s"]} | out
+
+
+def bounced_rays(surface, device, size) -> tuple[np.ndarray, np.ndarray]:
+    """Return origins a little off the surface that a picture shows, out of the scan's noise, and unit directions."""
+    camera = Camera.framing(surface, aspect=size[0] / size[1])
+    seen = clsurf.trace(surface, *camera.rays(size), device=device)
+    normal = seen.normal[seen.hit]
+    out = np.random.default_rng(0).normal(size=normal.shape)
+    out *= (np.sign((out * normal).sum(axis=1)) / np.linalg.norm(out, axis=1))[:, None]
+    return seen.position[seen.hit] + max(1e-3 * surface.diagonal, 2 * surface.bound) * normal, out
+
+
 def kernel_seconds(device, work, runs: int) -> dict[str, float]:
     """Return the median seconds that each kernel takes in one call of `work`."""
     found = []
@@ -222,6 +266,8 @@ def show(figures) -> None:
             goals = values["goals"] or ("-", "-")
             figure = f"{values['ms']:.1f} ms" if what == "frame" else f"{values['mrays_s']:.1f} Mrays/s"
             rows.append((f"{name}, {what}", figure, goals[0], goals[1]))
+            if what == "bounced" and "embree" in values:
+                rows.append((f"{name}, bounced, embree", f"{values['embree']['mrays_s']:.1f} Mrays/s", "-", "-"))
             if what == "single":
                 rows += [(f"{name}, single, {label}", f"{values[label]['mrays_s']:.1f} Mrays/s", "-", "-")
                          for label in ("kernel", "any", "mesh", "embree") if label in values]

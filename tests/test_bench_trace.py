@@ -17,7 +17,7 @@ def test_the_job_runs(device, monkeypatch, tmp_path, capsys):
     finally:
         scenes.scene.cache_clear()
     assert found["primary"]["pixels_that_differ"] < 1e-3
-    for what in ("primary", "shadows", "occlusion", "single"):
+    for what in ("primary", "shadows", "occlusion", "single", "bounced"):
         assert found[what]["mrays_s"] > 0 and found[what]["rays"] > 1000
     assert found["frame"]["ms"] > 0 and found["single"]["hits"] > 0.97 and found["single"]["kernel"]["mrays_s"] > 0
     said = capsys.readouterr().out
@@ -37,6 +37,15 @@ def test_rays_meet_their_targets():
     origins, directions, targets = trace.arbitrary_rays(scene, 100)
     assert np.linalg.norm(np.cross(targets - origins, directions), axis=1).max() < 1e-9
     assert (np.linalg.norm(origins - scene.box.mean(axis=0), axis=1) > 0.59 * scene.diagonal).all()
+
+
+def test_bounced_rays_leave_the_surface(device):
+    import clsurf
+    surface = clsurf.build_slim(small_torus(), device=device)
+    origins, directions = trace.bounced_rays(surface, device, (40, 30))
+    near = clsurf.project(surface, origins, device=device)
+    assert np.median(near.distance) == pytest.approx(max(1e-3 * surface.diagonal, 2 * surface.bound), rel=0.02)
+    assert ((near.normal * directions).sum(axis=1) > 0).mean() > 0.97 and len(origins) > 200
 
 
 def test_hits_beside_the_scan_are_a_wrong_answer(device):
