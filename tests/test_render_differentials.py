@@ -134,7 +134,7 @@ def test_differentials(device, torus, which, oriented):
     found = render.tile_slim(degree, view, records, pixels, oriented)
     tensors = twin.blended_tensors(degree, view, records, surface.normals[shown], pixels, found.hit, found.side,
                                    oriented)
-    wanted = twin.channels(view, *tensors, pixels)
+    wanted = twin.channels(view, *tensors, pixels, found.side if oriented else None)
     with Renderer(device) as r:
         frame = r.render(surface, camera, SMALL, ("depth", *names_of(degree)))
     hit = np.isfinite(frame.depth).ravel()

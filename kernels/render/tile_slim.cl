@@ -41,10 +41,9 @@
 #endif
 
 typedef struct {
-  VF depth, weight, fx, fy, ft, red, green, blue;
+  VF depth, weight, fx, fy, ft, red, green, blue, facing;
   VI nearest, number;
 #if DERIVATIVES || FUNCTION
-  VF facing;
   Jet jet;
 #endif
 } Blend;
@@ -230,12 +229,11 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   VI active = TRUE_LANES, any_hit = 0;
   Blend best;
   best.depth = infinite;
-  best.weight = best.fx = best.fy = best.ft = best.red = best.green = best.blue = 1.0f;
+  best.weight = best.fx = best.fy = best.ft = best.red = best.green = best.blue = best.facing = 1.0f;
   best.nearest = 0; best.number = 0;
 #if DERIVATIVES || FUNCTION
 #define CLEAR_BEST(d) best.jet.d = 0.0f;
   EACH_DERIVATIVE(CLEAR_BEST)
-  best.facing = 1.0f;
 #endif
   int cost = 0;
   for (int attempt = 0; attempt < TRIES; attempt++) {
@@ -279,8 +277,8 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
 #if DERIVATIVES || FUNCTION
 #define KEEP_DERIVATIVE(d) KEEP(jet.d);
     EACH_DERIVATIVE(KEEP_DERIVATIVE)
-    best.facing = SEL(best.facing, ORIENTED ? facing : (VF)(1.0f), found);
 #endif
+    best.facing = SEL(best.facing, ORIENTED ? facing : (VF)(1.0f), found);
     any_hit = any_hit | found;
     active = found & (sum.weight < SUPPORT);
     low = SEL(low, hit, active);
@@ -296,9 +294,15 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   float fx = view[FX], fy = view[FY];
   VF gx = best.fx * fx, gy = -best.fy * fy;
   VF gz = view[PERSPECTIVE] > 0.0f ? gx * ((px - view[CX]) / fx) + gy * ((view[CY] - py) / fy) - best.ft : -best.ft;
-  merge_plane(planes, FIELD_NORMAL, at, gx, closer);
-  merge_plane(planes, FIELD_NORMAL + 1, at, gy, closer);
-  merge_plane(planes, FIELD_NORMAL + 2, at, gz, closer);
+  VF nx = gx, ny = gy, nz = gz;
+#if ORIENTED
+  VF rx = 0.0f, ry = 0.0f;
+  if (view[PERSPECTIVE] > 0.0f) { rx = (px - view[CX]) / fx; ry = (view[CY] - py) / fy; }
+  outward_at_rims(rx, ry, best.facing, &nx, &ny, &nz);
+#endif
+  merge_plane(planes, FIELD_NORMAL, at, nx, closer);
+  merge_plane(planes, FIELD_NORMAL + 1, at, ny, closer);
+  merge_plane(planes, FIELD_NORMAL + 2, at, nz, closer);
 #if FIELD_COLOR >= 0
   VF inv = 1.0f / best.weight;
   merge_plane(planes, FIELD_COLOR, at, best.red * inv, closer);

@@ -19,7 +19,7 @@
 #define TRIES 4
 #endif
 
-typedef struct { VF depth, weight, fx, fy, ft, red, green, blue; VI number; } Blend;
+typedef struct { VF depth, weight, fx, fy, ft, red, green, blue, facing; VI number; } Blend;
 typedef struct { VF px, py, low, z, hit, facing; } Ray;
 
 // Pass 1: depth of every active ray's frontmost hit behind `low` and in front of `z`, and its side.
@@ -215,7 +215,8 @@ INLINE int trace_bin(__global const float *view, __global const float *boxes, __
     if (was_touched) before[b] = load_plane(planes, FIELD_DEPTH, at[b]);
     active[b] = TRUE_LANES; any_hit[b] = 0;
     best[b].depth = INFINITY;
-    best[b].weight = best[b].fx = best[b].fy = best[b].ft = best[b].red = best[b].green = best[b].blue = 1.0f;
+    best[b].weight = best[b].fx = best[b].fy = best[b].ft = best[b].facing = 1.0f;
+    best[b].red = best[b].green = best[b].blue = 1.0f;
     best[b].number = 0;
   }
   int going = 1;
@@ -245,6 +246,7 @@ INLINE int trace_bin(__global const float *view, __global const float *boxes, __
       sum[b].depth = ray[b].hit + sum[b].depth / sum[b].weight;
 #define KEEP(x) best[b].x = SEL(best[b].x, sum[b].x, found)
       KEEP(depth); KEEP(weight); KEEP(fx); KEEP(fy); KEEP(ft); KEEP(number);
+      best[b].facing = SEL(best[b].facing, ray[b].facing, found);
 #if HAS_COLOR
       KEEP(red); KEEP(green); KEEP(blue);
 #endif
@@ -264,6 +266,11 @@ INLINE int trace_bin(__global const float *view, __global const float *boxes, __
     if (!any_lane(closer)) continue;
     VF gx = best[b].fx, gy = best[b].fy;
     VF gz = packet.perspective ? gx * ray[b].px + gy * ray[b].py - best[b].ft : -best[b].ft;
+#if ORIENTED
+    VF upright = 0.0f;
+    outward_at_rims(packet.perspective ? ray[b].px : upright, packet.perspective ? ray[b].py : upright, best[b].facing,
+                    &gx, &gy, &gz);
+#endif
     merge_plane(planes, FIELD_NORMAL, at[b], gx, closer);
     merge_plane(planes, FIELD_NORMAL + 1, at[b], gy, closer);
     merge_plane(planes, FIELD_NORMAL + 2, at[b], gz, closer);

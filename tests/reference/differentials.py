@@ -6,7 +6,7 @@ import numpy as np
 
 from clsurf.surface.slim import frame_of_normals
 
-from .render import K0, K3, K4, K5, K6, K7, K8, K9, RADIUS, T_REF, height, local, opened, ray_poly, ray_root
+from .render import K0, K3, K4, K5, K6, K7, K8, K9, RADIUS, RIM_COSINE, T_REF, height, local, opened, ray_poly, ray_root
 
 
 def local_tensors(degree, records, at):
@@ -100,8 +100,11 @@ def function_tensors(degree, surface, camera, points, facing, step=1e-3):
     return gradient, hessian
 
 
-def channels(view, gradient, hessian, cubic, pixels):
-    """The channels of kernels/render/differentials.clh by name; directions in view axes."""
+def channels(view, gradient, hessian, cubic, pixels, side=None):
+    """The channels of kernels/render/differentials.clh by name; directions in view axes.
+
+    `side` (p,): -1 where an oriented surface is hit from behind; at rims directions are mirrored there as normals are.
+    """
     v, out = opened(view), {}
     across, up = (pixels[:, 0] - v.cx) / v.fx, (v.cy - pixels[:, 1]) / v.fy
     eye = np.stack([-across, -up, np.ones_like(up)], axis=1) if v.perspective else np.tile([0.0, 0, 1], (len(up), 1))
@@ -131,6 +134,9 @@ def channels(view, gradient, hessian, cubic, pixels):
         found = SimpleNamespace(mean=(k1 + k2) / 2, gaussian=k1 * k2, k1=k1, k2=k2, derivative1=change(t1),
                                 derivative2=change(t2), radial=w @ shape @ w, direction1=t1, direction2=t2,
                                 radial_derivative=change(w) - 2 * (eye[i] @ n) / sine * twist**2)
+        if side is not None and side[i] < 0 and abs(n @ eye[i]) < RIM_COSINE:
+            mirror = np.eye(3) - 2 * np.outer(eye[i], eye[i])
+            found.direction1, found.direction2 = mirror @ t1, mirror @ t2
         for name in out:
             out[name][i] = getattr(found, name)
     return out

@@ -10,7 +10,7 @@ import numpy as np
 
 from clsurf.surface.slim import frame_of_normals
 
-ALPHA, SUPPORT, TRIES, BACK_BIAS, INTERNAL_SCALE, ERROR_RADII = 0.8, 0.3, 4, 0.25, 1.5, 32
+ALPHA, SUPPORT, TRIES, BACK_BIAS, INTERNAL_SCALE, ERROR_RADII, RIM_COSINE = 0.8, 0.3, 4, 0.25, 1.5, 32, 0.4
 BUCKETS = 2048
 (XR, YR, T_REF, INV_T, UX, UY, VX, VY, WX, WY, U0, V0, W0, DU, DV, DW, K0, K1, K2, K3, K4, K5, RADIUS, RADIUS_PX,
  FOOT_LO, FOOT_HI, BIAS, REACH, K6, K7, K8, K9) = range(32)
@@ -184,6 +184,8 @@ def tile_slim(degree, view, records, pixels, oriented=True, footprint=None):
             getattr(out, name)[found] = value[found]
         active = found & (weight < SUPPORT)
         low = np.where(active, hit, low)
+    if oriented:
+        out.gradient = outward_at_rims(view, pixels, out.gradient, out.side)
     return out
 
 
@@ -213,6 +215,18 @@ def blended(degree, view, records, pixels, hit, side, oriented):
     if v.perspective:
         gz = gx * (pixels[:, 0] - v.cx) / v.fx + gy * (v.cy - pixels[:, 1]) / v.fy - ft
     return total, depth, np.stack([gx, gy, gz], axis=1), use.sum(axis=1)
+
+
+def outward_at_rims(view, pixels, gradient, side):
+    """Gradients (p, 3) to the eye; where the ray grazes a surface from behind, the outward one mirrored on the ray."""
+    v = opened(view)
+    ray = np.tile([0.0, 0.0, -1.0], (len(pixels), 1))
+    if v.perspective:
+        ray[:, 0], ray[:, 1] = (pixels[:, 0] - v.cx) / v.fx, (v.cy - pixels[:, 1]) / v.fy
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    along = (gradient * ray).sum(axis=1)
+    rim = (side < 0) & (np.abs(along) < RIM_COSINE * np.linalg.norm(gradient, axis=1))
+    return np.where(rim[:, None], 2 * along[:, None] * ray - gradient, gradient)
 
 
 def tile_balls(view, records, pixels):
