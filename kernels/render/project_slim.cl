@@ -4,21 +4,15 @@
 // The blocks bound the piece of surface inside the ball, a disc in (u, v) times LOW <= w <= HIGH, not the ball: seen
 // edge-on that is much less. A piece that reaches the eye's plane, or whose centre lies behind it, may appear anywhere, so
 // it gets the whole picture.
-#include "common/slim.clh"
+#include "common/visibility.clh"
 #include "common/select_slim.clh"
 #include "common/bins.clh"
 
-#ifndef ALPHA
-#define ALPHA 0.8f  // pass 1 draws balls shrunk by this
-#endif
 #ifndef BALLS
 #define BALLS 0  // 1: bound the balls themselves, at their own size, for tile_balls
 #endif
 #ifndef INTERNAL_SCALE
 #define INTERNAL_SCALE 1.5f  // radius that internal surfels are drawn with over their own
-#endif
-#ifndef BACK_BIAS
-#define BACK_BIAS 0.25f  // radii that a hit from behind is set back by
 #endif
 
 INLINE VF lesser(VF a, VF b) { return VMIN(a, b); }

@@ -7,7 +7,7 @@
 // VW > 1: one work-item per tile of TILE_BINS^2 bins, lanes over blocks of 4x4 pixels (8 lanes: 4x2, 4: 4x1).
 // VW = 1: one work-group of 64 work-items per tile, each a pixel of the bin at hand.
 // Twin: tests/reference/render.py, tile_slim.
-#include "common/slim.clh"
+#include "common/visibility.clh"
 #include "common/bins.clh"
 #include "common/planes.clh"
 #include "common/view.clh"
@@ -16,20 +16,8 @@
 #ifndef TILE_BINS
 #define TILE_BINS 4
 #endif
-#ifndef ALPHA
-#define ALPHA 0.8f
-#endif
-#ifndef SUPPORT
-#define SUPPORT 0.3f
-#endif
-#ifndef TRIES
-#define TRIES 4
-#endif
 #ifndef FUNCTION
 #define FUNCTION 0  // 1: normals and curvature of the blended function in place of blended ones, equation 8, right
-#endif
-#ifndef ORIENTED
-#define ORIENTED 1  // hits from behind are set back in pass 1 and never blended with hits from the front
 #endif
 
 #if VW == 1
@@ -47,15 +35,6 @@ typedef struct {
   Jet jet;
 #endif
 } Blend;
-
-INLINE VI inside_footprint(uint lo, uint hi, VF u, VF v) {
-  const float unit = 1.0f / 255.0f, half_root = 0.70710678f;
-  VF a = (u + v) * half_root, b = (v - u) * half_root;
-  return (u <= (float)(lo & 255u) * unit) & (a <= (float)(lo >> 8 & 255u) * unit)
-       & (v <= (float)(lo >> 16 & 255u) * unit) & (b <= (float)(lo >> 24) * unit)
-       & (-u <= (float)(hi & 255u) * unit) & (-a <= (float)(hi >> 8 & 255u) * unit)
-       & (-v <= (float)(hi >> 16 & 255u) * unit) & (-b <= (float)(hi >> 24) * unit);
-}
 
 #if VW == 1
 #define PAIRS __global const uint2 *

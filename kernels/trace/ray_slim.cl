@@ -7,24 +7,8 @@
 // A bottom node has a block of FIELDS vectors of 16 floats, one lane for each slot, and a list of the bottom nodes
 // whose balls reach into its piece of surface: groups near_first[bottom] to near_first[bottom + 1] - 1, each 16 boxes
 // of balls as a node has them, and the 16 bottom nodes (clsurf/trace/ray_slim.py).
-#include "common/slim.clh"
+#include "common/visibility.clh"
 #include "trace/ray_walk.clh"
-
-#ifndef ALPHA
-#define ALPHA 0.8f
-#endif
-#ifndef SUPPORT
-#define SUPPORT 0.3f
-#endif
-#ifndef TRIES
-#define TRIES 4
-#endif
-#ifndef BACK_BIAS
-#define BACK_BIAS 0.25f  // radii that a hit from behind is set back by
-#endif
-#ifndef ORIENTED
-#define ORIENTED 1
-#endif
 
 enum { AT_X, AT_Y, AT_Z, N_X, N_Y, N_Z,
        TURN,    // -1 / (sign of n_z + n_z), of the frame of the normal (common/frame.clh)
@@ -97,7 +81,7 @@ INLINE RayPoly poly_at(__global const float *k, Spot p, Spot d) {
   return f;
 }
 
-INLINE VI inside_footprint(VU lo, VU hi, VF u, VF v) {
+INLINE VI inside_footprints(VU lo, VU hi, VF u, VF v) {
   const float unit = 1.0f / 255.0f, half_root = 0.70710678f;
   VF a = (u + v) * half_root, b = (v - u) * half_root;
 #define SIDE_OF(word, shift) (TO_VF(AS_VI((word) >> (shift) & 255u)) * unit)
@@ -140,8 +124,8 @@ INLINE void leaf_hit(const Ray *r, const Goal *goal, Model m, int bottom, Found 
       __global const uint *feet = m.feet + (size_t)bottom * (2 * WIDE) + part;
       VU lo = *(__global const VU *)feet, hi = *(__global const VU *)(feet + WIDE);
       VI free = (lo & hi) == 0xffffffffu;
-      front = front & (free | inside_footprint(lo, hi, p1.u, p1.v));
-      back = back & (free | inside_footprint(lo, hi, p2.u, p2.v));
+      front = front & (free | inside_footprints(lo, hi, p1.u, p1.v));
+      back = back & (free | inside_footprints(lo, hi, p2.u, p2.v));
     }
     k1 = SEL((VF)(INFINITY), k1, front); k2 = SEL((VF)(INFINITY), k2, back);
     VI behind = k2 < k1;

@@ -12,12 +12,6 @@
 #ifndef TILE_BINS
 #define TILE_BINS 4
 #endif
-#ifndef SUPPORT
-#define SUPPORT 0.3f
-#endif
-#ifndef TRIES
-#define TRIES 4
-#endif
 
 typedef struct { VF depth, weight, fx, fy, ft, red, green, blue, facing; VI number; } Blend;
 typedef struct { VF px, py, low, z, hit, facing; } Ray;
