@@ -24,6 +24,7 @@ _TOO_LARGE = (cl.status_code.INVALID_BUFFER_SIZE, cl.status_code.MEM_OBJECT_ALLO
               cl.status_code.OUT_OF_RESOURCES, cl.status_code.OUT_OF_HOST_MEMORY)
 # Fastest first: a dragon frame took 9.4 ms on Intel's runtime and 10.3 on PoCL 3.0, its build 0.21 and 0.25 s.
 CPU_ORDER = ("intel", "pocl", "portable", "llvmpipe", "oclgrind")
+TRANSLATED = ("rusticl", "Oclgrind")  # platforms that take clang's output on, in which some builtins have no name
 WORDS = {"pocl": ("portable", "pocl"), "intel": ("intel",), "nvidia": ("nvidia",), "amd": ("amd", "advanced micro")}
 
 
@@ -55,6 +56,7 @@ class Device:
         self.local_bytes = cl_device.local_mem_size
         self.lanes = 16 if self.kind == "cpu" else 1
         self.profile: Profile | None = None
+        self.own_constants = {"TRANSLATED": 1} if self.platform_name in TRANSLATED else {}
         if "Portable" in self.platform_name:
             pocl_target.name_processor(cl_device)
         try:

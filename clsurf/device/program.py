@@ -81,7 +81,7 @@ class Profile:
 
 def build_program(device, path: str, constants: dict | None):
     """Compile the kernel file `path` for `device`; return (program, text)."""
-    text = kernel_text(path, constants)
+    text = kernel_text(path, device.own_constants | (constants or {}))
     dump = os.environ.get("CLSURF_DUMP")
     if dump:
         key = hashlib.sha256(text.encode()).hexdigest()[:8]
