@@ -268,8 +268,10 @@ def main(arguments=None) -> None:
     parser.add_argument("--size", choices=SIZES, default="small")
     parser.add_argument("--jobs", default="", help="some of them, with commas: " + ", ".join(JOBS))
     parser.add_argument("--surfaces", help="folder of surfaces that another device has made")
+    parser.add_argument("--lanes", type=int, help="another form of the kernels than the device's own")
     chosen = parser.parse_args(arguments)
     device, size = clsurf.open_device(chosen.device), SIZES[chosen.size]
+    device.lanes = chosen.lanes or device.lanes
     made = surfaces(device, size) if chosen.surfaces is None else load_surfaces(chosen.surfaces)
     names = [name for name in chosen.jobs.split(",") if name] or None
     np.savez_compressed(chosen.file, **answers(device, size, made, names))
