@@ -1,5 +1,6 @@
 """The renderer: a list of stages from a scene to a frame."""
 
+import os
 import threading
 import weakref
 
@@ -117,6 +118,8 @@ class Renderer:
         """
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
+        if self.device.process != os.getpid():
+            raise DeviceError("renderer: it was made before this process was forked: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
         factor = checked_supersampling(supersampling)
         picture, size = size, checked_size([n * factor for n in size])
