@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface)
+DRAWABLE = (SlimSurface, PatchSurface, Mesh)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
