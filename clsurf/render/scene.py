@@ -9,9 +9,10 @@ from ..errors import InputError
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
