@@ -179,7 +179,8 @@ def tile_surfels(surface, view, drawn, maps=True):
             plain = covered(atlas) and cosine**2 > spread**2 * (ray @ ray)
             if not plain:
                 seen = seen & (-np.sign(cosine) * ((normal @ view.rotation.T) * view.rays).sum(axis=1) < 0)
-        slab = (SLAB * r + float(surface.heights[s])) / max(abs(cosine), LEAN)
+        deep = max(abs(n @ p), -LEAN * p[2]) if view.p.perspective else max(abs(cosine), LEAN)
+        slab = (SLAB * r + float(surface.heights[s])) / deep
         rows.append((t, a**2 + b**2, inside, seen, -np.sign(cosine), r * BACK, slab, normal, s))
     pixels = len(view.rays)
     best, hit, side = np.full(pixels, np.inf), np.full(pixels, np.nan), np.zeros(pixels)
@@ -194,8 +195,7 @@ def tile_surfels(surface, view, drawn, maps=True):
     weight, depth, normal, count = np.zeros(pixels), np.zeros(pixels), np.zeros((pixels, 3)), np.zeros(pixels, int)
     for t, t2, inside, _, face, _, slab, n, s in rows:
         with np.errstate(all="ignore"):
-            middle = -(view.rotation[2] @ surface.positions[s].astype(np.float64) + view.zero[2])
-            apart = np.abs(hit / t - 1) * middle if view.p.perspective else np.abs(hit - t)
+            apart = np.abs(hit / t - 1) if view.p.perspective else np.abs(hit - t)
             use = inside & (apart < slab) & (face == side)
             g = np.where(use, (1 - t2) ** 3, 0)
         weight += g
