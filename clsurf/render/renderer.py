@@ -7,6 +7,7 @@ import numpy as np
 
 from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
@@ -14,6 +15,7 @@ from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
+from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
 from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
@@ -30,7 +32,7 @@ from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
-         SurfelHierarchy: (upload_surfels, draw_surfels)}
+         SurfelHierarchy: (upload_surfels, draw_surfels), Mesh: (upload_mesh, draw_mesh)}
 # Made and checked once: 14 us.
 DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS = (
     Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing())

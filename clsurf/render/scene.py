@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, Mesh)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
