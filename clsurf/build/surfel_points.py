@@ -133,8 +133,8 @@ def sampled_mesh(mesh: Mesh, spacing) -> Mesh:
     used[faces] = True
     own_normals = np.where(used[:, None], own_normals, 0)  # loose vertices are no part of the surface
     return Mesh(np.concatenate([mesh.vertices, *new[0]]).astype(np.float32), None,
-                joined(own_normals, new[1], np.float32), joined(mesh.colors, [np.rint(c) for c in new[2]], np.uint8), joined(mesh.uv, new[3], np.float32),
-                mesh.texture, mesh.origin)
+                joined(own_normals, new[1], np.float32), joined(mesh.colors, [np.rint(c) for c in new[2]], np.uint8),
+                joined(mesh.uv, new[3], np.float32), mesh.texture, mesh.origin)
 
 
 def thirds(k: int) -> NDArray:

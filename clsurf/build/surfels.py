@@ -196,5 +196,6 @@ def hybrid_parts(mesh: Mesh, spacing, device, report) -> tuple[dict, int]:
         heights=discs.heights, spreads=discs.spreads, level=tree.level, child_offset=child_offset, children=children,
         lights=None if discs.colors is None else discs.colors.astype(np.float32), vertex_lights=vertex_lights,
         colors=None if discs.colors is None else straight(discs.colors),
-        vertices=np.where(finite[:, None], mesh.vertices, 0), vertex_normals=normals, vertex_colors=vertex_colors(mesh), triangles=faces[tree.order[at]],
+        vertices=np.where(finite[:, None], mesh.vertices, 0), vertex_normals=normals,
+        vertex_colors=vertex_colors(mesh), triangles=faces[tree.order[at]],
         triangle_offset=triangle_offset, spacing=float(np.median(edges)), bound=0.0, bound_share=1.0), len(tree.start)

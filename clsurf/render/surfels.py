@@ -5,7 +5,7 @@ kernels/render/*surfels.cl.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from ..surface.surfel import SurfelHierarchy
 from .shade import Look, Shading
 from .slim import LARGEST_COUNT, rainbow
 from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, view_floats
+from .triangles import Triangles, draw_triangles, place_triangles
 
 SURFEL_FLOATS, RECORD_FLOATS = 16, 32  # kernels/common/surfel.clh
 IS_BASE, IS_ROOT, IS_COVERED, HAS_TRIANGLES = 0x100, 0x200, 0x400, 0x800
@@ -44,7 +45,9 @@ class SurfelUpload:
     slabs: NDArray  # (count,) float32, model units: kernels/common/surfel.clh, S_SLAB
     center: NDArray  # (3,) float64, relative to origin
     reach: float  # every surfel lies within this of `center`
-    triangle_offset: NDArray | None
+    triangle_offset: NDArray | None = None
+    faces: NDArray | None = None  # (f, 3) int32
+    triangles: Triangles | None = None  # vertices; the faces are those of a frame
 
 
 def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
@@ -99,7 +102,20 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
         None if surface.color_atlas is None else atlas(surface.color_atlas),
         None if colors is None else device.upload(colors), device.upload(surface.level),
         np.concatenate([[0], np.searchsorted(surface.level, values, side="right")]), surface.radii, surface.origin,
-        records[:, 10], center, reach, surface.triangle_offset)
+        records[:, 10], center, reach, *below_of(device, surface))
+
+
+def below_of(device: Device, surface: SurfelHierarchy) -> tuple:
+    """Return what draws the triangles of the hybrid form; nothing of the pure one."""
+    if not surface.hybrid:
+        return ()
+    device.check_memory(positions=16 * len(surface.vertices), normals=16 * len(surface.vertices))
+    fours = lambda rows: device.upload(np.pad(np.asarray(rows, np.float32), ((0, 0), (0, 1))))  # noqa: E731
+    light = None if surface.vertex_colors is None else fours(LINEAR_OF_BYTE[surface.vertex_colors[:, :3]])
+    finite = np.isfinite(surface.vertices).all(axis=1)
+    faces = np.where(finite[surface.triangles].all(axis=1)[:, None], surface.triangles, 0)  # one vertex: not drawn
+    triangles = Triangles(fours(surface.vertices), device.upload(faces[:1]), fours(surface.vertex_normals), light)
+    return surface.triangle_offset, faces, triangles
 
 
 def covered_maps(surface: SurfelHierarchy) -> NDArray:
@@ -203,6 +219,10 @@ def draw_surfels(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpl
     view = device.upload(floats)
     state = select_surfels(device, scratch, upload, view, interior if lod > 0 else 0.0)
     drawn = np.flatnonzero(state == DRAWN).astype(np.int32)
+    if upload.triangles is not None:
+        below = np.flatnonzero(state == BY_TRIANGLES)
+        if len(below):
+            draw_below(device, scratch, grid, upload, below, matrix, camera, look, number)
     if not len(drawn):
         return
     records, footprints = project_surfels(device, scratch, upload, view, drawn)
@@ -216,3 +236,14 @@ def draw_surfels(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpl
     maps = drawing.maps and not look.shading.look.startswith("ball")
     tile_surfels(device, scratch, grid, upload, view, records, pairs, colors, color_maps, maps, bool(perspective),
                  slack, number)
+
+
+def draw_below(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpload, chosen: NDArray, matrix, camera,
+               look: Look, number: int) -> None:
+    """Draw the triangles right below the surfels `chosen`."""
+    first = upload.triangle_offset[chosen].astype(np.int64)
+    count = upload.triangle_offset[chosen + 1] - first
+    at = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
+    triangles = replace(upload.triangles, faces=device.upload(upload.faces[at]))
+    floats = place_triangles(camera, grid.size, matrix, upload.origin, upload.center, upload.reach, look.shading.color)
+    draw_triangles(device, scratch, grid, triangles, floats, look, number)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import bounds_of, frozen
+from .cloud import PointCloud
 from .mesh import Mesh
 from .placed import Placed, placed
 
@@ -185,6 +186,15 @@ class SurfelHierarchy:
         across = int(self.map_size.max(initial=0))
         return (f"SurfelHierarchy({finest}, {inner:,} inner surfels with maps up to {across} x {across}, "
                 f"{self.nbytes:,} bytes, bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
+
+
+def finest_scan(surface: SurfelHierarchy) -> Mesh | PointCloud:
+    """Return the finest level as a scan: the base surfels as points, or the mesh."""
+    if surface.hybrid:
+        return surface.mesh
+    base = surface.base
+    return PointCloud(surface.positions[base], surface.normals[base],
+                      None if surface.colors is None else surface.colors[base], origin=surface.origin)
 
 
 def _check_offsets(name: str, offset: NDArray, count: int) -> None:

@@ -6,8 +6,7 @@
 #ifndef K
 #define K 16
 #endif
-#define OPEN 2.0f    // spacings beyond which a direction has no neighbour: the rim of an open surface,
-#define RIM 0.6f     // where discs reach so many spacings
+#define RIM 0.6f     // spacings, where no neighbour lies within 60 degrees of a direction: the rim of an open surface
 #define LARGEST 1.5f // spacings
 #define LEAST 0.55f
 
@@ -18,9 +17,9 @@ __kernel void surfel_radii(int count, __global const float *points, __global con
   if (i >= count) return;
   float3 p = vload3(i, points), n = vload3(i, normals), u, v;
   frame_of_normal(n, &u, &v);
-  // The spacing: 3 pi of area hold the neighbours up to the twelfth, which lies at 2 spacings on average.
-  const float cosines[16] = {1.0f, 0.92387953f, 0.70710678f, 0.38268343f, 0.0f, -0.38268343f, -0.70710678f, -0.92387953f,
-                             -1.0f, -0.92387953f, -0.70710678f, -0.38268343f, 0.0f, 0.38268343f, 0.70710678f, 0.92387953f};
+  const float cosines[16] = {1.0f, 0.92387953f, 0.70710678f, 0.38268343f, 0.0f, -0.38268343f, -0.70710678f,
+                             -0.92387953f, -1.0f, -0.92387953f, -0.70710678f, -0.38268343f, 0.0f, 0.38268343f,
+                             0.70710678f, 0.92387953f};
   float x[K], y[K], d2[K];
   int found = 0;
   for (int j = 0; j < K; j++) {
@@ -39,12 +38,14 @@ __kernel void surfel_radii(int count, __global const float *points, __global con
   float reach = 0.0f;
   for (int a = 0; a < 16; a++) {
     float c = cosines[a], s = cosines[(a + 12) & 15], nearest = INFINITY;
+    int open = 1;
     for (int j = 0; j < found; j++) {
       float along = c * x[j] + s * y[j];
       float t = along > 0.0f ? 0.5f * d2[j] / along : INFINITY;
       nearest = t < nearest ? t : nearest;
+      open &= !(along > 0.0f && along * along > 0.25f * d2[j]);
     }
-    float most = nearest > OPEN * spacing ? RIM * spacing : LARGEST * spacing;
+    float most = (open ? RIM : LARGEST) * spacing;
     nearest = nearest < most ? nearest : most;
     reach = nearest > reach ? nearest : reach;
   }

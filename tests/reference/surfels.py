@@ -30,7 +30,8 @@ def surfel_radii(positions, normals, neighbours, overlap):
         for direction in np.stack([np.cos(angles), np.sin(angles)], axis=1):
             along = flat @ direction
             nearest = (0.5 * d2[along > 0] / along[along > 0]).min(initial=np.inf)
-            most = 0.6 * spacing if nearest > 2 * spacing else 1.5 * spacing
+            rim = not (along > 0.5 * np.sqrt(d2)).any()
+            most = (0.6 if rim else 1.5) * spacing
             reach = max(reach, min(nearest, most))
         radii[i], spacings[i] = overlap * reach, spacing
     return radii, spacings
@@ -75,7 +76,7 @@ def normal_map(surface, s):
 
 
 def triangle_map(surface, s):
-    """Algorithm 2: unit normals (w * w, 3), NaN where the line misses; of several triangles that nearest to the plane."""
+    """Algorithm 2: unit normals (w * w, 3), NaN where the line misses; of several hits that nearest to the plane."""
     places, n = texel_places(surface, s), surface.normals[s].astype(np.float64)
     out, best = np.full_like(places, np.nan), np.full(len(places), 2 * float(surface.spheres[s]))
     corners = surface.vertices[surface.triangles].astype(np.float64)
@@ -163,7 +164,8 @@ def tile_surfels(surface, view, drawn, maps=True):
             a, b = place @ u, place @ v
         ray = p / -p[2] if view.p.perspective else np.array([0, 0, -1.0])
         cosine = n @ ray
-        if abs(cosine) < EDGE * np.linalg.norm(ray):
+        ahead = not view.p.perspective or -p[2] > 0.5 * r
+        if ahead and abs(cosine) < EDGE * np.linalg.norm(ray):
             continue
         inside = (a**2 + b**2 < 1) & (t > 0 if view.p.perspective else True)
         normal = np.broadcast_to(surface.normals[s].astype(np.float64), (len(t), 3))
@@ -193,7 +195,7 @@ def tile_surfels(surface, view, drawn, maps=True):
         best, hit, side = np.where(better, key, best), np.where(better, t, hit), np.where(better, face, side)
         nearest = np.where(better, s, nearest)
     weight, depth, normal, count = np.zeros(pixels), np.zeros(pixels), np.zeros((pixels, 3)), np.zeros(pixels, int)
-    for t, t2, inside, _, face, _, slab, n, s in rows:
+    for t, t2, inside, _, face, _, slab, n, _ in rows:
         with np.errstate(all="ignore"):
             apart = np.abs(hit / t - 1) if view.p.perspective else np.abs(hit - t)
             use = inside & (apart < slab) & (face == side)
@@ -227,3 +229,28 @@ def angles(codes, normals):
     """Angles in degrees between coded and given normals."""
     cosine = (decoded_normals(codes) * normals).sum(axis=1)
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def ray_surfels(surface, origins, directions):
+    """Distance (n,), normal (n, 3) and surfel (n,) of the closest hits on the base surfels; directions are unit."""
+    base = surface.base
+    p, n, r = (a[base].astype(np.float64) for a in (surface.positions, surface.normals, surface.radii))
+    count = len(origins)
+    distance, normal, number = np.full(count, np.inf), np.full((count, 3), np.nan), np.full(count, -1)
+    for i, (o, d) in enumerate(zip(origins - surface.origin, directions, strict=True)):
+        along = n @ d
+        with np.errstate(all="ignore"):
+            t = ((p - o) * n).sum(axis=1) / along
+        away2 = ((o + t[:, None] * d - p) ** 2).sum(axis=1)
+        face = np.where(along < 0, 1, -1)
+        key = np.where((away2 < (CORE * r) ** 2) & (t > 0), t + np.where(face < 0, BACK * r, 0), np.inf)
+        k = np.argmin(key)
+        if not np.isfinite(key[k]):
+            continue
+        use = (away2 < r**2) & (np.abs(t - t[k]) * np.maximum(np.abs(along), LEAN) < SLAB * r) & (face == face[k])
+        g = np.where(use, (1 - away2 / r**2) ** 3, 0)
+        distance[i], number[i] = (g[use] @ t[use]) / g.sum(), base[k]
+        mean = face[k] * (g[:, None] * n).sum(axis=0)
+        mean /= np.linalg.norm(mean)
+        normal[i] = -mean if mean @ d > 0 else mean
+    return distance, normal, number
