@@ -17,6 +17,7 @@ from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
 from .build.slim import build_slim
+from .build.surfels import build_surfels
 from .device import Device, Profile, open_device
 from .errors import Error
 from .io import load, load_frames, save
@@ -27,6 +28,7 @@ from .render.renderer import Renderer, render
 from .render.scene import Scene
 from .render.shade import Light, Shading
 from .render.slim_drawing import SlimDrawing
+from .render.surfel_drawing import SurfelDrawing
 from .report.page import report
 from .surface.cloud import PointCloud
 from .surface.mesh import Mesh
@@ -34,6 +36,7 @@ from .surface.patch import PatchSurface
 from .surface.placed import Placed
 from .surface.ranges import RangeImage, RangeScan
 from .surface.slim import SlimSurface
+from .surface.surfel import SurfelHierarchy
 from .trace.hits import Hits, trace
 
 __version__ = "0.1.0"
@@ -41,7 +44,8 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
     "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
+    "SlimDrawing", "SlimSurface", "SurfaceError", "SurfelDrawing", "SurfelHierarchy", "build_patches", "build_slim",
+    "build_surfels", "color_map", "curvature", "error",
     "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
     "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
 ]

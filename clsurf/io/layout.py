@@ -17,8 +17,10 @@ from clsurf.surface.mesh import Mesh
 from clsurf.surface.patch import PatchSurface
 from clsurf.surface.ranges import RangeImage, RangeScan
 from clsurf.surface.slim import SlimSurface
+from clsurf.surface.surfel import SurfelHierarchy
 
-KINDS = {"slim": SlimSurface, "patches": PatchSurface, "mesh": Mesh, "points": PointCloud, "ranges": RangeScan}
+KINDS = {"slim": SlimSurface, "patches": PatchSurface, "surfels": SurfelHierarchy, "mesh": Mesh, "points": PointCloud,
+         "ranges": RangeScan}
 
 
 def to_arrays(thing) -> tuple[str, dict[str, NDArray], dict[str, Any]]:

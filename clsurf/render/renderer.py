@@ -11,6 +11,7 @@ from ..errors import DeviceError, InputError
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
@@ -25,14 +26,17 @@ from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
+from .surfels import draw_surfels, upload_surfels
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
-         Mesh: (upload_mesh, draw_mesh)}
+         SurfelHierarchy: (upload_surfels, draw_surfels), Mesh: (upload_mesh, draw_mesh)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM = Shading(), PatchDrawing(), SlimDrawing()
+DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS = (
+    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing())
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -73,7 +77,7 @@ class Renderer:
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None) -> Frame:
+               slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -107,6 +111,8 @@ class Renderer:
             How spatial patches are drawn.
         slim : SlimDrawing, optional
             How SLIM surfaces are drawn.
+        surfels : SurfelDrawing, optional
+            How surfel hierarchies are drawn.
 
         Returns
         -------
@@ -140,6 +146,9 @@ class Renderer:
         slim = DEFAULT_SLIM if slim is None else slim
         if not isinstance(slim, SlimDrawing):
             raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
+        surfels = DEFAULT_SURFELS if surfels is None else surfels
+        if not isinstance(surfels, SurfelDrawing):
+            raise InputError(f"surfels: expected a clsurf.SurfelDrawing, got {surfels!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
@@ -161,7 +170,8 @@ class Renderer:
                 lamps = self.device.upload(floats)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, slim, lamps, "cost" in channels), number)
+                                            Look(shading, lod, patches, slim, lamps, "cost" in channels, surfels),
+                                            number)
                 if traced:
                     light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
@@ -269,13 +279,14 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None,
+           surfels: SurfelDrawing | None = None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim)
+                                                supersampling, patches, slim, surfels)
 
 
 _shared = threading.local()

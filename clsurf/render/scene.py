@@ -10,9 +10,10 @@ from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface, Mesh)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, Mesh)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,6 +1,6 @@
 """Shading: material, lights, background, and the last stage, which writes the channels of the picture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from ..surface.srgb import to_linear
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
 from .tiles import BIN, Grid, Scratch
 
 CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np.float32), "position": (3, np.float32),
@@ -135,6 +136,7 @@ class Look:
     slim: SlimDrawing
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
+    surfels: SurfelDrawing = field(default_factory=SurfelDrawing)
 
 
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
