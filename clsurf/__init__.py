@@ -16,6 +16,7 @@ from .analysis.sparsity import slim_of_error, sparsity
 from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
+from .build.scale_map import build_scale_map
 from .build.slim import build_slim
 from .device import Device, Profile, open_device
 from .errors import Error
@@ -33,6 +34,7 @@ from .surface.mesh import Mesh
 from .surface.patch import PatchSurface
 from .surface.placed import Placed
 from .surface.ranges import RangeImage, RangeScan
+from .surface.scale_map import ScaleMap
 from .surface.slim import SlimSurface
 from .trace.hits import Hits, trace
 
@@ -40,8 +42,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
+    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "ScaleMap", "Scene", "Shading",
+    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_scale_map", "build_slim", "color_map", "curvature", "error",
     "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
     "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
 ]

@@ -1,0 +1,59 @@
+"""Plain float64 twins of the kernels of scale maps: every ray against every triangle, every node by itself."""
+
+import numpy as np
+
+from clsurf.surface.cube import interpolated, texel_directions
+
+from .trace_rays import ray_triangles, unit
+
+
+def scale_hits(vertices, faces, size):
+    """Lists of (distance, triangle) of every texel, in the texels' order, for vertices relative to the centre."""
+    found = []
+    for direction in texel_directions(size).reshape(-1, 3):
+        t, triangle = ray_triangles(vertices, faces, np.zeros(3), direction)
+        found.append(sorted(zip(t.tolist(), triangle.tolist(), strict=True)))
+    return found
+
+
+def pick_scale_hits(lists, layers, outermost):
+    """Distances and triangles (layers, texels), NaN and -1 for holes, of sorted lists."""
+    distance, triangle = np.full((layers, len(lists)), np.nan), np.full((layers, len(lists)), -1)
+    for texel, hits in enumerate(lists):
+        for k, (t, number) in enumerate((hits[::-1] if outermost else hits)[:layers]):
+            distance[k, texel], triangle[k, texel] = t, number
+    return distance, triangle
+
+
+def icosphere(level):
+    """Vertices (n, 3) float64 on the unit sphere and faces, counter-clockwise from outside, of a subdivided icosahedron."""
+    g = (1 + 5**0.5) / 2
+    v = unit(np.array([[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0], [0, -1, g], [0, 1, g], [0, -1, -g], [0, 1, -g],
+                       [g, 0, -1], [g, 0, 1], [-g, 0, -1], [-g, 0, 1]], float))
+    f = np.array([[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2], [10, 7, 6],
+                  [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5], [2, 4, 11], [6, 2, 10],
+                  [8, 6, 7], [9, 8, 1]])
+    for _ in range(level):
+        edges = np.sort(f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        once, at = np.unique(edges, axis=0, return_inverse=True)
+        a, b, c = len(v) + at.reshape(-1, 3).T
+        v = np.concatenate([v, unit(v[once].sum(axis=1))])
+        f = np.concatenate([np.stack(x, axis=1) for x in ((f[:, 0], a, c), (f[:, 1], b, a), (f[:, 2], c, b), (a, b, c))])
+    return v, f
+
+
+def sphere_distance(directions, center, radius=1.0):
+    """Distance from zero, inside, to a sphere in unit directions (..., 3)."""
+    b = directions @ np.asarray(center, float)
+    return b + np.sqrt(b * b - np.dot(center, center) + radius**2)
+
+
+def ellipsoid_distance(directions, axes):
+    """Distance from zero to the ellipsoid about it."""
+    return 1 / np.linalg.norm(directions / np.asarray(axes, float), axis=-1)
+
+
+def filtered(surface, directions, layer=0):
+    """Lambda (n,) of a map in directions (n, 3), NaN in holes."""
+    value, known = interpolated(np.nan_to_num(surface.lambdas[layer].astype(float)), surface.valid[layer], directions)
+    return np.where(known, value, np.nan)
