@@ -25,6 +25,7 @@ from .render.camera import Camera
 from .render.frame import Frame
 from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
+from .render.scale_map_drawing import ScaleMapDrawing
 from .render.scene import Scene
 from .render.shade import Light, Shading
 from .render.slim_drawing import SlimDrawing
@@ -42,7 +43,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "ScaleMap", "Scene", "Shading",
+    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading",
     "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_scale_map", "build_slim", "color_map", "curvature", "error",
     "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
     "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",

@@ -9,6 +9,7 @@ from ..errors import InputError
 from ..surface.srgb import to_linear
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
+from .scale_map_drawing import ScaleMapDrawing
 from .slim_drawing import SlimDrawing
 from .tiles import BIN, Grid, Scratch
 
@@ -133,6 +134,7 @@ class Look:
     lod: float
     patches: PatchDrawing
     slim: SlimDrawing
+    scale_map: ScaleMapDrawing
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
 
