@@ -21,7 +21,7 @@ from .shade import Look
 from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, new_footprints, view_floats
 
 BLOCK_SIDE = 4  # kernels/render/cells.clh
-RECORD_FLOATS = 16 + 12 * 16
+RECORD_FLOATS = 16 + 32 * 16
 COLOR = 26  # of the view buffer
 LARGEST_NODES = 1 << 24  # whole numbers of a float: kernels/render/cells_shown.clh
 LARGEST_BLOCKS = 1 << 22

@@ -21,81 +21,6 @@
 #else
 #define FIRST_BIT(x) (31 - (int)clz((x) & -(x)))
 #endif
-#define WIDER 1e-3f  // pixels that triangles are widened by, so that rounding leaves no gaps between neighbours
-
-// What the pixels of a bin need to know of 16 cells, relative to the bin's middle; 16 floats each.
-enum { EDGE_AB, EDGE_CA = 3, EDGE_DC = 6, EDGE_BD = 9, DIAGONAL_1 = 12, DIAGONAL_2 = 15,  // 3: x, y, constant
-       DEPTH_1 = 18, DEPTH_2 = 21, LOW_1 = 24, HIGH_1, LOW_2, HIGH_2, QUARTERS,
-       BACK,  // bit 0, 1: the triangle is seen from behind
-       PLANES };
-#if VW == 1
-#define SPACE __local
-#else
-#define SPACE __private
-#endif
-#define PUT_CELLS(plane, value) (*(SPACE VF *)(cells + (plane) * CELLS + part) = (value))
-
-// The edge from (px, py, pw) to (qx, qy, qw): a x + b y + c, positive inside where `sign` is that of the triangle.
-#define PUT_EDGE(plane, p, q, sign) do { \
-    VF ea = (Y[p] * W[q] - Y[q] * W[p]) * (sign), eb = (X[q] * W[p] - X[p] * W[q]) * (sign); \
-    VF ec = (X[p] * Y[q] - X[q] * Y[p]) * (sign), wide = SEL(ea, -ea, ea < 0.0f) + SEL(eb, -eb, eb < 0.0f); \
-    PUT_CELLS(plane, ea); PUT_CELLS((plane) + 1, eb); PUT_CELLS((plane) + 2, ec + WIDER * wide); \
-    a += ea * V[opposite]; b += eb * V[opposite]; c += ec * V[opposite]; } while (0)
-
-// Set up the cells of `part`: edges in homogeneous coordinates, which need no clipping at the eye's plane (Olano, Greer,
-// 1997), and the planes of -1 / depth or depth over the screen.
-INLINE void set_up(__global const float *record, int part, float bx, float by, int perspective, SPACE float *cells) {
-  VF X[4], Y[4], T[4], W[4], V[4], zero = 0.0f, one = 1.0f;
-  VI back = 0;
-  for (int k = 0; k < 4; k++) {
-    T[k] = *(__global const VF *)(record + CORNERS + (3 * k + 2) * CELLS + part);
-    W[k] = perspective ? T[k] : one;
-    X[k] = *(__global const VF *)(record + CORNERS + 3 * k * CELLS + part) - bx * W[k];
-    Y[k] = *(__global const VF *)(record + CORNERS + (3 * k + 1) * CELLS + part) - by * W[k];
-    V[k] = perspective ? -one : T[k];
-  }
-  for (int triangle = 0; triangle < 2; triangle++) {
-    int p = triangle ? 3 : 0, q = triangle ? 2 : 1, r = triangle ? 1 : 2, opposite;
-    VF volume = X[p] * (Y[q] * W[r] - Y[r] * W[q]) + Y[p] * (X[r] * W[q] - X[q] * W[r])
-              + W[p] * (X[q] * Y[r] - X[r] * Y[q]);
-    back = back | SEL((VI)(0), (VI)(1 << triangle), volume < 0.0f);
-    VF sign = SEL(one, -one, volume < 0.0f), a = zero, b = zero, c = zero;
-    opposite = r; PUT_EDGE(triangle ? EDGE_DC : EDGE_AB, p, q, sign);
-    opposite = q; PUT_EDGE(triangle ? EDGE_BD : EDGE_CA, r, p, sign);
-    opposite = p; PUT_EDGE(triangle ? DIAGONAL_2 : DIAGONAL_1, q, r, sign);
-    VF size = SEL(volume, -volume, volume < 0.0f), inverse = SEL(one / size, zero, size < 1e-30f);
-    int plane = triangle ? DEPTH_2 : DEPTH_1;
-    PUT_CELLS(plane, a * inverse); PUT_CELLS(plane + 1, b * inverse); PUT_CELLS(plane + 2, c * inverse);
-    // Depths lie between those of the corners, but for triangles that cross the eye's plane.
-    VF low = INFINITY, high = -INFINITY;
-    for (int k = 0; k < 3; k++) {
-      int at = k == 0 ? p : k == 1 ? q : r;
-      VF value = perspective ? -one / T[at] : T[at];
-      low = lesser(low, value); high = greater(high, value);
-    }
-    VI touches = (W[p] <= 1e-6f) | (W[q] <= 1e-6f) | (W[r] <= 1e-6f);
-    PUT_CELLS(triangle ? LOW_2 : LOW_1, SEL(low, (VF)(-INFINITY), touches));
-    PUT_CELLS(triangle ? HIGH_2 : HIGH_1, SEL(high, (VF)(INFINITY), touches));
-  }
-  // Which quarters of the bin each cell may touch.
-  VF low_x = INFINITY, high_x = -INFINITY, low_y = INFINITY, high_y = -INFINITY;
-  VI touches = 0;
-  for (int k = 0; k < 4; k++) {
-    VF inverse = one / W[k], x = X[k] * inverse, y = Y[k] * inverse;
-    low_x = lesser(low_x, x); high_x = greater(high_x, x);
-    low_y = lesser(low_y, y); high_y = greater(high_y, y);
-    touches = touches | NOT(W[k] > 1e-6f);  // a hole's corner too
-  }
-  VI left = touches | ((low_x <= -0.5f + WIDER) & (high_x >= -3.5f - WIDER));
-  VI right = touches | ((low_x <= 3.5f + WIDER) & (high_x >= 0.5f - WIDER));
-  VI above = touches | ((low_y <= -0.5f + WIDER) & (high_y >= -3.5f - WIDER));
-  VI below = touches | ((low_y <= 3.5f + WIDER) & (high_y >= 0.5f - WIDER));
-  VI quarters = SEL((VI)(0), (VI)(1), left & above) | SEL((VI)(0), (VI)(2), right & above)
-              | SEL((VI)(0), (VI)(4), left & below) | SEL((VI)(0), (VI)(8), right & below);
-  PUT_CELLS(QUARTERS, AS_VF(quarters));
-  PUT_CELLS(BACK, AS_VF(back));
-}
-
 typedef struct {
   VF z;       // -1 / depth, or depth where the picture is orthographic
   VI seen;    // node A of the cell times 4, 2 for the triangle DCB, 1 where it is seen from behind; -1: nothing
@@ -107,37 +32,30 @@ typedef struct {
 #define CELL(plane) cells[(plane) * CELLS + cell]
 #define EDGE(plane) (px * CELL(plane) + py * CELL((plane) + 1) + CELL((plane) + 2))
 
-// Test pixels against one cell; `drawn` has bit 0 for ABC, bit 1 for DCB.
-INLINE void draw_cell(SPACE const float *cells, int cell, uint drawn, int node, VF px, VF py, VF nearest, Pixels *at) {
-  VF zero = 0.0f;
-  if (drawn & 1u) {
-    VF ab = EDGE(EDGE_AB), ca = EDGE(EDGE_CA), bc = EDGE(DIAGONAL_1);
-    VI in = (ab >= zero) & (ca >= zero) & (bc >= zero);
-    if (any_lane(in)) {
-      VF z = EDGE(DEPTH_1);
-      z = lesser(greater(z, (VF)(CELL(LOW_1))), (VF)(CELL(HIGH_1)));
-      in = in & (z < at->z) & (z > nearest);
-      at->z = SEL(at->z, z, in);
-      at->seen = SEL(at->seen, (VI)(node * 4 + (as_int(CELL(BACK)) & 1)), in);
+// Test pixels against one triangle; px, py are relative to the block's centre, `seen` is what a pixel keeps of it.
+INLINE void draw_triangle(__global const float *cells, int cell, int across_p, int across_q, int across_r, int depth,
+                          int low, int seen, VF px, VF py, VF nearest, Pixels *at) {
+  VF zero = 0.0f, p = EDGE(across_p), q = EDGE(across_q), r = EDGE(across_r);
+  VI in = (p >= zero) & (q >= zero) & (r >= zero);
+  if (!any_lane(in)) return;
+  VF z = EDGE(depth);
+  z = lesser(greater(z, (VF)(CELL(low))), (VF)(CELL(low + 1)));
+  in = in & (z < at->z) & (z > nearest);
+  at->z = SEL(at->z, z, in);
+  at->seen = SEL(at->seen, (VI)(seen), in);
 #if !CAST
-      at->p = SEL(at->p, bc, in); at->q = SEL(at->q, ca, in); at->r = SEL(at->r, ab, in);
+  at->p = SEL(at->p, p, in); at->q = SEL(at->q, q, in); at->r = SEL(at->r, r, in);
 #endif
-    }
-  }
-  if (drawn & 2u) {
-    VF dc = EDGE(EDGE_DC), bd = EDGE(EDGE_BD), cb = EDGE(DIAGONAL_2);
-    VI in = (dc >= zero) & (bd >= zero) & (cb >= zero);
-    if (any_lane(in)) {
-      VF z = EDGE(DEPTH_2);
-      z = lesser(greater(z, (VF)(CELL(LOW_2))), (VF)(CELL(HIGH_2)));
-      in = in & (z < at->z) & (z > nearest);
-      at->z = SEL(at->z, z, in);
-      at->seen = SEL(at->seen, (VI)(node * 4 + 2 + (as_int(CELL(BACK)) >> 1)), in);
-#if !CAST
-      at->p = SEL(at->p, cb, in); at->q = SEL(at->q, bd, in); at->r = SEL(at->r, dc, in);
-#endif
-    }
-  }
+}
+
+INLINE void draw_cell(__global const float *record, int cell, int node, VF px, VF py, VF nearest, Pixels *at) {
+  __global const float *cells = record + HEAD;
+  if (as_uint(record[MASK_1]) >> cell & 1u)
+    draw_triangle(cells, cell, DIAGONAL_1, EDGE_CA, EDGE_AB, DEPTH_1, LOW_1,
+                  4 * node + (as_int(record[BACK_1]) >> cell & 1), px, py, nearest, at);
+  if (as_uint(record[MASK_2]) >> cell & 1u)
+    draw_triangle(cells, cell, DIAGONAL_2, EDGE_BD, EDGE_DC, DEPTH_2, LOW_2,
+                  4 * node + 2 + (as_int(record[BACK_2]) >> cell & 1), px, py, nearest, at);
 }
 #include "render/cells_shown.clh"
 
@@ -156,7 +74,6 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
   const float unit = view[SCALE];
   // In front of the near plane: -1 / near is no larger than every -1 / depth behind it.
   const float nearest = perspective ? (view[NEAR] > 0.0f ? -unit / view[NEAR] : -INFINITY) : view[NEAR] / unit;
-  SPACE float cells[PLANES * CELLS] __attribute__((aligned(64)));
   int x0 = tile % tiles_x * TILE_BINS, y0 = tile / tiles_x * TILE_BINS;
   for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
     int bin_x = x0 + i % TILE_BINS, bin_y = y0 + i / TILE_BINS;
@@ -171,26 +88,23 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
     if (was_touched) before = load_plane(planes, FIELD_DEPTH, at_); \
     VF start = perspective ? -unit / before : before * (1.0f / unit);
 #if VW == 1
-    float px = (pixel & 7) - 3.5f, py = (pixel >> 3) - 3.5f;
-    uint quarter = (pixel & 7) >> 2 | (pixel >> 5) << 1;
+    float px = bx + (pixel & 7) - 3.5f, py = by + (pixel >> 3) - 3.5f;
     Pixels here;
     START(pixel)
     here.z = start; here.seen = -1;
     for (int e = begin; e < end; e++) {
       __global const float *record = records + (size_t)INDEX_OF(pairs[e]) * CELL_RECORD;
-      barrier(CLK_LOCAL_MEM_FENCE);
-      if (pixel < CELLS) set_up(record, pixel, bx, by, perspective, cells);
-      barrier(CLK_LOCAL_MEM_FENCE);
-      uint mask_1 = as_uint(record[MASK_1]), mask_2 = as_uint(record[MASK_2]);
       int base = as_int(record[BASE_NODE]);
-      for (int cell = 0; cell < CELLS; cell++) {
-        uint drawn = (mask_1 >> cell & 1u) | (mask_2 >> cell & 1u) << 1;
-        tests += drawn ? BIN_PIXELS : 0;
-        if (drawn && as_int(CELL(QUARTERS)) >> quarter & 1)
-          draw_cell(cells, cell, drawn, base + (cell >> 2) * side + (cell & 3), px, py, nearest, &here);
+      float x = px - record[CENTER_X], y = py - record[CENTER_Y];
+      for (uint todo = as_uint(record[MASK_1]) | as_uint(record[MASK_2]); todo; todo &= todo - 1u) {
+        int cell = FIRST_BIT(todo);
+        __global const float *cells = record + HEAD;
+        tests += BIN_PIXELS;
+        if (x >= CELL(LEFT) && x <= CELL(RIGHT) && y >= CELL(TOP) && y <= CELL(BOTTOM))
+          draw_cell(record, cell, base + (cell >> 2) * side + (cell & 3), x, y, nearest, &here);
       }
     }
-    show_pixels(view, nodes, side, grid_nodes, surface, &here, before, px + bx, py + by, planes, pixel);
+    show_pixels(view, nodes, side, grid_nodes, surface, &here, before, px, py, planes, pixel);
     barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     if (pixel == 0) touched[bin] = (was_touched ? touched[bin] : 0) + tests;
 #else
@@ -210,27 +124,28 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
         if (pair.y >> (b / (16 / VW)) & 1u) open = open | (all[b].z > key) | (VI)(perspective & !(key < 0.0f) ? -1 : 0);
       if (!any_lane(open)) continue;
       __global const float *record = records + (size_t)INDEX_OF(pair) * CELL_RECORD;
-      uint mask_1 = as_uint(record[MASK_1]), mask_2 = as_uint(record[MASK_2]), quarters[4] = {0, 0, 0, 0};
+      uint drawn = as_uint(record[MASK_1]) | as_uint(record[MASK_2]), quarters[4] = {0, 0, 0, 0};
       int base = as_int(record[BASE_NODE]);
-      for (int part = 0; part < CELLS; part += VW) {
-        set_up(record, part, bx, by, perspective, cells);
-        VI may = *(VI *)(cells + QUARTERS * CELLS + part);
-        for (int q = 0; q < 4; q++) quarters[q] |= bits_of_lanes((may & (1 << q)) != 0) << part;
+      float ox = bx - record[CENTER_X], oy = by - record[CENTER_Y];
+      for (int part = 0; part < CELLS; part += VW) {  // the quarters of the bin whose pixels' centres a cell may hold
+        __global const float *cells = record + HEAD + part;
+        VF left = *(__global const VF *)(cells + LEFT * CELLS), right = *(__global const VF *)(cells + RIGHT * CELLS);
+        VF top = *(__global const VF *)(cells + TOP * CELLS), bottom = *(__global const VF *)(cells + BOTTOM * CELLS);
+        VI in_left = (left <= ox - 0.5f) & (right >= ox - 3.5f), in_right = (left <= ox + 3.5f) & (right >= ox + 0.5f);
+        VI above = (top <= oy - 0.5f) & (bottom >= oy - 3.5f), below = (top <= oy + 3.5f) & (bottom >= oy + 0.5f);
+        quarters[0] |= bits_of_lanes(in_left & above) << part; quarters[1] |= bits_of_lanes(in_right & above) << part;
+        quarters[2] |= bits_of_lanes(in_left & below) << part; quarters[3] |= bits_of_lanes(in_right & below) << part;
       }
-      for (int q = 0; q < 4; q++) {
-        uint todo = quarters[q] & (mask_1 | mask_2);
-        while (todo) {
-          int cell = FIRST_BIT(todo);
-          todo &= todo - 1u;
+      for (int q = 0; q < 4; q++)
+        for (uint todo = quarters[q] & drawn; todo; todo &= todo - 1u) {
+          int cell = FIRST_BIT(todo), node = base + (cell >> 2) * side + (cell & 3);
           tests += 16;
-          uint drawn = (mask_1 >> cell & 1u) | (mask_2 >> cell & 1u) << 1;
           for (int b = q * (16 / VW); b < (q + 1) * (16 / VW); b++) {
             int qx = (q & 1) * 4, qy = (q >> 1) * 4 + b % (16 / VW) * (VW / 4);
-            VF px = TO_VF(LANE_INDEX & 3) + (qx - 3.5f), py = TO_VF(LANE_INDEX >> 2) + (qy - 3.5f);
-            draw_cell(cells, cell, drawn, base + (cell >> 2) * side + (cell & 3), px, py, nearest, &all[b]);
+            VF px = TO_VF(LANE_INDEX & 3) + (ox + qx - 3.5f), py = TO_VF(LANE_INDEX >> 2) + (oy + qy - 3.5f);
+            draw_cell(record, cell, node, px, py, nearest, &all[b]);
           }
         }
-      }
     }
     for (int b = 0; b < 64 / VW; b++) {
       int q = b / (16 / VW), qx = (q & 1) * 4, qy = (q >> 1) * 4 + b % (16 / VW) * (VW / 4);
