@@ -3,6 +3,7 @@
 import numpy as np
 
 from clsurf.surface.cube import interpolated, texel_directions
+from clsurf.surface.slim import frame_of_normals
 
 from .trace_rays import ray_triangles, unit
 
@@ -57,3 +58,39 @@ def filtered(surface, directions, layer=0):
     """Lambda (n,) of a map in directions (n, 3), NaN in holes."""
     value, known = interpolated(np.nan_to_num(surface.lambdas[layer].astype(float)), surface.valid[layer], directions)
     return np.where(known, value, np.nan)
+
+
+def smooth_map(size, center=(0.0, 0, 0), bits=32, layers=1, normals=None, f=None, **more):
+    """A map of the exact distances f(directions), by default of the unit sphere about `center`, seen from zero."""
+    from clsurf.surface.scale_map import ScaleMap, encoded
+    d = texel_directions(size)
+    values = sphere_distance(d, center) if f is None else f(d)
+    radius = float(values.max())
+    values = np.broadcast_to(values / radius, (layers, 6, size, size))
+    return ScaleMap((0, 0, 0), radius, encoded(values, bits), np.ones(values.shape, bool), normals, **more)
+
+
+def net_mesh(surface, layer=0):
+    """The closed net of texels as vertices (n, 3), radii, and triangles, cells with holes left out."""
+    from clsurf.surface.cube import border_directions, bordered
+    size = surface.size
+    value, valid = bordered(np.nan_to_num(surface.lambdas[layer].astype(float)), surface.valid[layer], size)
+    points = (value[..., None] * border_directions(size)).reshape(-1, 3)
+    at = np.arange(6 * (size + 2) ** 2).reshape(6, size + 2, size + 2)
+    a, b, c, d = at[:, :-1, :-1], at[:, :-1, 1:], at[:, 1:, :-1], at[:, 1:, 1:]
+    whole = valid[:, :-1, :-1] & valid[:, :-1, 1:] & valid[:, 1:, :-1] & valid[:, 1:, 1:]
+    a, b, c, d = (x[whole] for x in (a, b, c, d))
+    return points, np.concatenate([np.stack([a, b, c], 1), np.stack([d, c, b], 1)])
+
+
+def scale_normals(surface, gradient=True, epsilon=None):
+    """Normals (6, s, s, 3) from numerical derivatives of the interpolated map, as the kernel defines them."""
+    size = surface.size
+    d = texel_directions(size).reshape(-1, 3)
+    u, v = frame_of_normals(d)
+    e = 2 / size if epsilon is None else epsilon
+    p = []
+    for step in (u, -u, v, -v):
+        q = d + e * step
+        p.append(filtered(surface, q)[:, None] * unit(q))
+    return unit(np.cross(p[0] - p[1], p[2] - p[3])).reshape(6, size, size, 3)
