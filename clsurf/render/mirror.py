@@ -13,7 +13,7 @@ from ..trace.hits import Hits, trace
 from .shade import Shading
 
 CHANNELS = ("position", "normal", "id")  # that a picture needs for it
-# Where a ray starts, in node spacings of patches or median radii of surfels: up the normal, and along itself.
+# Where a ray starts, in node spacings of patches, texels or median radii of surfels: up the normal, and along itself.
 LIFT, START = 0.05, 0.5
 
 
@@ -33,6 +33,8 @@ def grain(surface, matrix) -> float:
     scale = 1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if hasattr(surface, "radii"):
         own = surface.radii[surface.leaf] if surface.leaf.any() else surface.radii
+    elif hasattr(surface, "scales"):
+        return scale * surface.radius * 2 / surface.size
     else:
         own = np.linalg.norm(surface.axis_x, axis=1)
     return scale * float(np.median(own)) if len(own) else 0.0

@@ -94,3 +94,30 @@ def scale_normals(surface, gradient=True, epsilon=None):
         q = d + e * step
         p.append(filtered(surface, q)[:, None] * unit(q))
     return unit(np.cross(p[0] - p[1], p[2] - p[3])).reshape(6, size, size, 3)
+
+
+def ray_scale_map(surface, origin, direction, samples=20000):
+    """Distances of one ray's hits, ascending: changes of sign of |p| - R lambda(p) at many points, then bisection."""
+    d = unit(direction)
+    reach = surface.radius * 1.01
+    o = np.asarray(origin, float) - surface.center
+    b = o @ d
+    disc = b * b - o @ o + reach**2
+    if disc <= 0:
+        return np.zeros(0)
+    t = np.linspace(max(-b - np.sqrt(disc), 0), -b + np.sqrt(disc), samples)
+
+    def outside(t):
+        p = o + np.asarray(t)[:, None] * d
+        return np.linalg.norm(p, axis=1) - surface.radius * filtered(surface, p)
+
+    f = outside(t)
+    at = np.flatnonzero((f[:-1] > 0) != (f[1:] > 0))
+    low, high = t[at], t[at + 1]
+    for _ in range(40):
+        if not len(at):
+            break
+        middle = (low + high) / 2
+        same = (outside(middle) > 0) == (f[at] > 0)
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return (low + high) / 2
