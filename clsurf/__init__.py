@@ -43,8 +43,9 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_scale_map", "build_slim", "color_map", "curvature", "error",
-    "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
-    "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
+    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "ScaleMap",
+    "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches",
+    "build_scale_map", "build_slim", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels",
+    "line_surface", "lines", "load", "load_frames", "models", "open_device", "project", "render", "report", "save",
+    "slim_of_error", "smooth", "sparsity", "trace",
 ]

@@ -1,4 +1,4 @@
-"""Scale maps in the renderer: exact spheres, orders, points on the map's own surface, both forms, near plane, scenes."""
+"""Scale maps in the renderer: exact spheres, orders, points on the map itself, both forms, near plane, scenes."""
 
 import numpy as np
 import pytest
@@ -222,7 +222,7 @@ def test_scale_normals(device):
 def test_stored_normals_and_their_absence(renderers):
     d = texel_directions(32)
     plain = twin.smooth_map(32)
-    turned = twin.smooth_map(32, normals=encoded_normals(unit(d + (0.4, 0, 0))))
+    turned = twin.smooth_map(32, normals=encoded_normals(unit(d + np.array([0.4, 0, 0]))))
     camera = Camera.look_at((0, 0, 3.0), (0, 0, 0), (0, 1, 0), fov=40)
     middle = lambda s, **o: renderers[0].render(s, camera, SIZE, scale_map=ScaleMapDrawing(**o)).normal[36, 48]  # noqa: E731
     assert middle(turned) @ unit(np.array([0.4, 0, 1])) > 0.999 > 0.99 > middle(turned) @ (0, 0, 1)

@@ -127,7 +127,8 @@ def test_plain_data(tmp_path):
     dict(scales=np.zeros((0, 6, 4, 4), np.uint8)), dict(scales=np.full((1, 6, 4, 4), np.nan, np.float32)),
     dict(normals=np.zeros((1, 6, 3, 4, 3), np.uint8))))
 def test_wrong_arrays_are_refused(wrong):
-    good = dict(center=(0, 0, 0), radius=1.0, scales=np.zeros((1, 6, 4, 4), np.uint8), valid=np.ones((1, 6, 4, 4), bool))
+    good = dict(center=(0, 0, 0), radius=1.0, scales=np.zeros((1, 6, 4, 4), np.uint8),
+                valid=np.ones((1, 6, 4, 4), bool))
     ScaleMap(**good)
     with pytest.raises(ValueError, match=r"expected|radius"):
         ScaleMap(**good | wrong)

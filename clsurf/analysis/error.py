@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..build.project import project
 from ..build.radius import robust_box
+from ..build.triangles import triangle_distances
 from ..device import open_device
 from ..errors import InputError
 from ..io import load
@@ -22,8 +23,9 @@ from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
 from ..surface.placed import Placed
 from ..surface.ranges import RangeScan
+from ..surface.scale_map import ScaleMap
+from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import SlimSurface, frame_of_normals
-from .triangles import triangle_distances
 
 ALPHA = 2 / 3  # of a ball's radius: the part that carries the surface
 
@@ -92,8 +94,9 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
 
     Parameters
     ----------
-    surface : SlimSurface, PatchSurface, Mesh or Placed
-        SLIM surfaces are projected onto (see `project`); of patches, the triangles between opaque nodes count.
+    surface : SlimSurface, PatchSurface, ScaleMap, Mesh or Placed
+        SLIM surfaces are projected onto (see `project`); of patches, the triangles between opaque nodes count,
+        of scale maps those between valid texels.
     scan : Mesh, PointCloud, RangeScan, (n, 3) array_like of world positions, or the path of a scan
         Points that are not finite are left out.
     both : bool
@@ -112,8 +115,10 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
         A scan without finite points, a surface without leaves or faces, or `both` without triangles in the scan.
     """
     scan = _as_scan(scan)
-    if not isinstance(surface.surface if isinstance(surface, Placed) else surface, SlimSurface | PatchSurface | Mesh):
-        raise InputError(f"surface: expected a SlimSurface, a PatchSurface or a Mesh, got {type(surface).__name__}")
+    if not isinstance(surface.surface if isinstance(surface, Placed) else surface, SlimSurface | PatchSurface | ScaleMap
+                      | Mesh):
+        raise InputError("surface: expected a SlimSurface, a PatchSurface, a ScaleMap or a Mesh, got "
+                         f"{type(surface).__name__}")
     if both and not (isinstance(scan, Mesh) and len(scan.faces)):
         raise InputError("both: expected a scan with faces to measure the surface's points against, got points only")
     device = open_device(device)
@@ -137,7 +142,7 @@ def _as_scan(scan) -> Mesh | PointCloud:
         return scan.to_points()
     if isinstance(scan, Mesh | PointCloud):
         return scan
-    if isinstance(scan, SlimSurface | PatchSurface | Placed):
+    if isinstance(scan, SlimSurface | PatchSurface | ScaleMap | Placed):
         raise InputError(f"scan: expected a scan, got a surface ({type(scan).__name__})")
     try:
         points = np.asarray(scan, np.float64)
@@ -161,7 +166,8 @@ def distances(surface, points: NDArray, device) -> NDArray:
 
 
 def _as_mesh(surface) -> Mesh:
-    mesh = patch_mesh(surface) if isinstance(surface, PatchSurface) else surface
+    mesh = patch_mesh(surface) if isinstance(surface, PatchSurface) else \
+        scale_mesh(surface) if isinstance(surface, ScaleMap) else surface
     if not len(mesh.faces):
         raise InputError("surface: expected a mesh with faces, got none")
     return mesh

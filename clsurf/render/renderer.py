@@ -166,7 +166,8 @@ class Renderer:
                 lamps = self.device.upload(floats)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, slim, scale_map, lamps, "cost" in channels), number)
+                                            Look(shading, lod, patches, slim, scale_map, lamps, "cost" in channels),
+                                            number)
                 if traced:
                     light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,

@@ -172,7 +172,8 @@ def _cells(device, cast, side, grids, points, nodes) -> Cells:
     stride = -(-(count + BLOCK_SIDE * side + BLOCK_SIDE) // 64) * 64  # blocks read past the last node
     positions = np.full((3, stride), np.nan, np.float32)
     positions[:, :count] = points.T
-    cells = Cells(cast, side, grids, stride, device.upload(positions), device.upload(np.ascontiguousarray(nodes, np.float32)))
+    nodes = np.ascontiguousarray(nodes, np.float32)
+    cells = Cells(cast, side, grids, stride, device.upload(positions), device.upload(nodes))
     if cells.blocks > LARGEST_BLOCKS:
         raise InputError(f"scale map: expected at most {LARGEST_BLOCKS:,} blocks of cells, got {cells.blocks:,}: use a "
                          "smaller size or a lower level")

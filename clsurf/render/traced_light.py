@@ -20,7 +20,7 @@ from .tiles import BIN, Grid, Scratch, view_floats
 
 LAMP_FLOATS = 8
 LARGEST_LAMPS = 32  # bits of a word
-GRAINS = 1.5  # node spacings that shadow rays start above patches, whose cells are two flat triangles to rays, and texels
+GRAINS = 1.5  # node spacings that shadow rays start above patches, whose cells are two triangles to rays, and texels
 REACH = 0.25  # of the scene's diagonal: what ambient occlusion looks for by default
 
 
@@ -76,7 +76,7 @@ def cast(device: Device, scratch: Scratch, grid: Grid, casters, views, lamps: De
 
 
 def cast_others(device: Device, grid: Grid, scene, camera, mask: DeviceArray) -> None:
-    """Add to the mask (bins, 64) the lamps that all but SLIM surfaces hide: single rays from the points to the lamps."""
+    """Add to the mask (bins, 64) the lamps that all but SLIM surfaces hide: single rays from points to lamps."""
     parts = [part for part in scene.surfaces if not isinstance(getattr(part, "surface", part), SlimSurface)]
     if not parts:
         return

@@ -21,8 +21,8 @@ NORMAL_HALF = 127.5  # a normal's component c is stored as round((c + 1) 127.5)
 class ScaleMap:
     """A surface that rays from a centre meet once: its distance in every direction, as a cube map.
 
-    Texel (row i, column j) of face f looks along ``cube.texel_directions(size)[f, i, j]``; faces are +X -X +Y -Y +Z -Z in
-    OpenGL's orientation. In that direction the surface lies at `center` + lambda `radius` direction, where lambda is
+    Texel (row i, column j) of face f looks along ``cube.texel_directions(size)[f, i, j]``; faces are +X -X +Y -Y +Z -Z
+    in OpenGL's orientation. In that direction the surface lies at `center` + lambda `radius` direction, where lambda is
     the code in `scales` over the largest one (255, 65535; floats are lambda itself). Between texels lambda is
     interpolated on one closed net of texel centres (see clsurf/surface/cube.py), across the edges of the cube too.
 
@@ -155,8 +155,8 @@ class ScaleMap:
         low, high = self.bounds
         layers = f", {self.layers} layers" if self.layers > 1 else ""
         return (f"ScaleMap(6 x {self.size} x {self.size}, {self.bits} bits{layers}"
-                f"{', normals' if self.normals is not None else ''}, {self.hole_share:.1%} holes, {self.nbytes:,} bytes, "
-                f"bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
+                f"{', normals' if self.normals is not None else ''}, {self.hole_share:.1%} holes, "
+                f"{self.nbytes:,} bytes, bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
 
 
 def encoded(lambdas: NDArray, bits: int) -> NDArray:

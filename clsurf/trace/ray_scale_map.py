@@ -6,7 +6,7 @@ from ..device import Device
 from ..surface.cube import border_directions, bordered
 from ..surface.scale_map import ScaleMap
 from .kinds import NOTHING, Traced, items, register
-from .tree import WIDTH, node_boxes, plant
+from .tree import node_boxes, plant
 
 SIDE = 4  # cells along a side of a block
 NODES = (SIDE + 1) ** 2

@@ -27,11 +27,12 @@ def pick_scale_hits(lists, layers, outermost):
 
 
 def icosphere(level):
-    """Vertices (n, 3) float64 on the unit sphere and faces, counter-clockwise from outside, of a subdivided icosahedron."""
+    """Vertices (n, 3) on the unit sphere and faces, counter-clockwise from outside, of a subdivided icosahedron."""
     g = (1 + 5**0.5) / 2
     v = unit(np.array([[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0], [0, -1, g], [0, 1, g], [0, -1, -g], [0, 1, -g],
                        [g, 0, -1], [g, 0, 1], [-g, 0, -1], [-g, 0, 1]], float))
-    f = np.array([[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2], [10, 7, 6],
+    f = np.array([[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2],
+                  [10, 7, 6],
                   [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5], [2, 4, 11], [6, 2, 10],
                   [8, 6, 7], [9, 8, 1]])
     for _ in range(level):
@@ -39,7 +40,8 @@ def icosphere(level):
         once, at = np.unique(edges, axis=0, return_inverse=True)
         a, b, c = len(v) + at.reshape(-1, 3).T
         v = np.concatenate([v, unit(v[once].sum(axis=1))])
-        f = np.concatenate([np.stack(x, axis=1) for x in ((f[:, 0], a, c), (f[:, 1], b, a), (f[:, 2], c, b), (a, b, c))])
+        parts = (f[:, 0], a, c), (f[:, 1], b, a), (f[:, 2], c, b), (a, b, c)
+        f = np.concatenate([np.stack(x, axis=1) for x in parts])
     return v, f
 
 
