@@ -10,6 +10,7 @@ from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .average import average, checked_supersampling, fine_channels
@@ -22,6 +23,8 @@ from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
+from .scale_map import draw_scale_map, upload_scale_map
+from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
@@ -33,10 +36,11 @@ from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
-         SurfelHierarchy: (upload_surfels, draw_surfels), Mesh: (upload_mesh, draw_mesh)}
+         SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
+         Mesh: (upload_mesh, draw_mesh)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS = (
-    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing())
+DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP = (
+    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing())
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -77,7 +81,8 @@ class Renderer:
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None) -> Frame:
+               slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+               scale_map: ScaleMapDrawing | None = None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -90,7 +95,8 @@ class Renderer:
         channels : sequence of str
             Of "color", "depth", "normal", "position", "id", "count", "level", "cost" (see `Frame`); "cost" is the
             number of surfel evaluations per pixel of the pixel's bin of 8x8, or that of tests of a pixel against a
-            cell of a patch. For patches "count" is 1 and "level" the mip level, 0 for the patch's own nodes.
+            cell of a patch or a scale map. For patches "count" is 1 and "level" the mip level, 0 for the patch's own
+            nodes; for scale maps 1 and the layer.
             Curvature of SLIM surfaces (float32, NaN elsewhere), from blended derivatives of the surfels (paper,
             equation 8, left), world units: "mean", "gaussian", "k1" >= "k2" (1/length; positive where the surface
             curves away from the side its stored normals point to, that of the eye where it is not oriented),
@@ -113,6 +119,8 @@ class Renderer:
             How SLIM surfaces are drawn.
         surfels : SurfelDrawing, optional
             How surfel hierarchies are drawn.
+        scale_map : ScaleMapDrawing, optional
+            How scale maps are drawn.
 
         Returns
         -------
@@ -149,6 +157,9 @@ class Renderer:
         surfels = DEFAULT_SURFELS if surfels is None else surfels
         if not isinstance(surfels, SurfelDrawing):
             raise InputError(f"surfels: expected a clsurf.SurfelDrawing, got {surfels!r}")
+        scale_map = DEFAULT_SCALE_MAP if scale_map is None else scale_map
+        if not isinstance(scale_map, ScaleMapDrawing):
+            raise InputError(f"scale_map: expected a clsurf.ScaleMapDrawing, got {scale_map!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
@@ -170,7 +181,8 @@ class Renderer:
                 lamps = self.device.upload(floats)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, slim, lamps, "cost" in channels, surfels),
+                                            Look(shading, lod, patches, slim, surfels, scale_map, lamps,
+                                                 "cost" in channels),
                                             number)
                 if traced:
                     light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
@@ -192,8 +204,8 @@ class Renderer:
 
     def _new_grid(self, placed, size, channels, curved, shading, patches, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
-        colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
-                                               for s, _ in placed)
+        colored = shading.model_colors and any(getattr(s, name, None) is not None
+                                               for s, _ in placed for name in ("colors", "color"))
         colored |= shading.look.startswith("ball")
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
@@ -280,13 +292,13 @@ def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 7
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
            patches: PatchDrawing | None = None, slim: SlimDrawing | None = None,
-           surfels: SurfelDrawing | None = None) -> Frame:
+           surfels: SurfelDrawing | None = None, scale_map: ScaleMapDrawing | None = None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim, surfels)
+                                                supersampling, patches, slim, surfels, scale_map)
 
 
 _shared = threading.local()
