@@ -20,7 +20,9 @@ from .build.slim import build_slim
 from .device import Device, Profile, open_device
 from .errors import Error
 from .io import load, load_frames, save
+from .io.video import write_video
 from .render.camera import Camera
+from .render.camera_path import CameraPath, load_cameras, render_frames, save_cameras, turntable
 from .render.frame import Frame
 from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
@@ -39,9 +41,10 @@ from .trace.hits import Hits, trace
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
-    "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
-    "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
+    "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing",
+    "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene",
+    "Shading", "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature",
+    "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_cameras",
+    "load_frames", "models", "open_device", "project", "render", "render_frames", "report", "save", "save_cameras",
+    "slim_of_error", "smooth", "sparsity", "trace", "turntable", "write_video",
 ]
