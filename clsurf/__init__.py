@@ -37,14 +37,16 @@ from .surface.placed import Placed
 from .surface.ranges import RangeImage, RangeScan
 from .surface.slim import SlimSurface
 from .trace.hits import Hits, trace
+from .view.canvas import view
+from .view.viewer import Viewer
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing",
     "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene",
-    "Shading", "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature",
-    "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_cameras",
-    "load_frames", "models", "open_device", "project", "render", "render_frames", "report", "save", "save_cameras",
-    "slim_of_error", "smooth", "sparsity", "trace", "turntable", "write_video",
+    "Shading", "SlimDrawing", "SlimSurface", "SurfaceError", "Viewer", "build_patches", "build_slim", "color_map",
+    "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load",
+    "load_cameras", "load_frames", "models", "open_device", "project", "render", "render_frames", "report", "save",
+    "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable", "view", "write_video",
 ]

@@ -89,7 +89,7 @@ def motion(out: Path, turntable: int | None, path: Path | None, frames: int | No
     checked_fps(out, fps)
     lens = "ignore" if ignore_distortion else "refuse"
     if turntable is None and path is None:
-        return Motion(None, None, 0, fps, _camera_of(camera, lens) if camera else None)
+        return Motion(None, None, 0, fps, camera_of(camera, lens) if camera else None)
     known_video(out)
     if path is None:
         return Motion(turntable, None, turntable, fps, None)
@@ -99,7 +99,8 @@ def motion(out: Path, turntable: int | None, path: Path | None, frames: int | No
     return Motion(None, way, 30 * gaps + (not way.closed) if frames is None else frames, fps, None)
 
 
-def _camera_of(text: str, distortion: str):
+def camera_of(text: str, distortion: str):
+    """Return the camera that FILE or FILE:NAME means."""
     from ..render.camera_path import load_cameras
     path, name = text, ""
     if not Path(text).exists() and ":" in text:

@@ -11,6 +11,7 @@ from ..surface.patch import PatchSurface
 from ..surface.slim import SlimSurface
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
+from .clip import checked_clip, view_clip
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
 from .mirror import CHANNELS as MIRROR_CHANNELS
@@ -69,7 +70,7 @@ class Renderer:
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None) -> Frame:
+               slim: SlimDrawing | None = None, clip=None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -103,6 +104,9 @@ class Renderer:
             How spatial patches are drawn.
         slim : SlimDrawing, optional
             How SLIM surfaces are drawn.
+        clip : (4,) or (n, 4) array_like, optional
+            Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
+            that the inside is seen. What is cut off still throws shadows and is seen in mirrors.
 
         Returns
         -------
@@ -118,7 +122,7 @@ class Renderer:
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
-        factor = checked_supersampling(supersampling)
+        factor, clip = checked_supersampling(supersampling), checked_clip(clip)
         picture, size = size, checked_size([n * factor for n in size])
         asked, channels = channels, fine_channels(channels, factor)
         curved = wanted_differentials(channels)
@@ -144,7 +148,8 @@ class Renderer:
             placed, origin = scene.placed, scene_origin(scene)
             traced = wants_traced_light(shading, channels)
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not traced
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, planes=not at_once)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, view_clip(clip, camera),
+                                  planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             if at_once:
@@ -174,7 +179,7 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, planes: bool) -> Grid:
+    def _new_grid(self, placed, size, channels, curved, shading, patches, clip, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
         colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
                                                for s, _ in placed)
@@ -185,7 +190,7 @@ class Renderer:
         traced = wants_traced_light(shading, channels)
         layout = Layout(color=(colored or lit or traced) and "color" in channels, id="id" in channels,
                         count="count" in channels, level="level" in channels, lit=lit, traced=traced,
-                        differentials=curved)
+                        clip_planes=len(clip), differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,
@@ -193,11 +198,11 @@ class Renderer:
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
         patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
         if not planes:
-            return Grid(size, self.tile_bins, layout, None, None, patch_bins)
+            return Grid(size, self.tile_bins, layout, None, None, patch_bins, clip)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
         return Grid(size, self.tile_bins, layout, touched,
-                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins)
+                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins, clip)
 
     def _uploaded(self, surface):
         upload = self._uploads.get(surface)
@@ -263,13 +268,13 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, clip=None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim)
+                                                supersampling, patches, slim, clip)
 
 
 _shared = threading.local()
