@@ -67,7 +67,9 @@ def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (102
     logging.getLogger("rendercanvas").setLevel(logging.ERROR)
     try:
         if chosen in ("notebook", "offscreen"):
-            return attached(viewer, _canvas_class(chosen, module)(size=size, max_fps=FASTEST), module.loop)
+            # Offscreen there is no loop: every picture is the full one, then the fine one, as it is asked for.
+            loop = module.loop if chosen == "notebook" else None
+            return attached(viewer, _canvas_class(chosen, module)(size=size, max_fps=FASTEST), loop)
         if chosen == "browser":
             _browser(viewer, module, size, host, port)
         elif chosen == "window":
@@ -118,7 +120,7 @@ def backend_module(backend: str):
 def attached(viewer: Viewer, canvas, loop, leave=None):
     """Connect a viewer with a canvas of rendercanvas, and return it; `leave` is called where the user asks to."""
     context = canvas.get_context("bitmap")
-    waiting = []  # whether a refinement is on its way
+    waiting, left = [], []  # whether a refinement is on its way, and whether the user has been let go
 
     def draw():
         if viewer.closed:
@@ -139,10 +141,10 @@ def attached(viewer: Viewer, canvas, loop, leave=None):
 
         def again():
             waiting.clear()
-            left = viewer.due()
-            if left is not None and left > 0:  # it has moved meanwhile
+            rest = viewer.due()
+            if rest is not None and rest > 0:  # it has moved meanwhile
                 refine()
-            elif left is not None and not canvas.get_closed():
+            elif rest is not None and not canvas.get_closed():
                 canvas.request_draw()
         # At once would leave events no time; later ones are then asked for by the next picture.
         loop.call_later(max(seconds, 0.01), again)
@@ -151,7 +153,8 @@ def attached(viewer: Viewer, canvas, loop, leave=None):
     def handle(event):
         if not viewer.closed and viewer.handle(event):
             canvas.request_draw()
-        if viewer.closed:
+        if viewer.closed and not left:
+            left.append(True)  # closing tells of it again
             (leave or canvas.close)()
     canvas.request_draw(draw)
     canvas.viewer = viewer
@@ -159,8 +162,14 @@ def attached(viewer: Viewer, canvas, loop, leave=None):
 
 
 def _canvas_class(backend: str, module):
-    if backend != "notebook":
-        return module.RenderCanvas
+    if backend == "offscreen":
+        class OffscreenCanvas(module.RenderCanvas):
+            """A canvas whose pictures know of the events before them."""
+
+            def draw(self):
+                self._process_events()  # no loop does
+                return super().draw()
+        return OffscreenCanvas
 
     class NotebookCanvas(module.RenderCanvas):
         """A widget that leaves a still picture where widgets are not shown: in a saved or exported notebook."""

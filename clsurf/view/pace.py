@@ -34,10 +34,13 @@ class Pace:
 
     def quality(self, now: float) -> Quality:
         """Return how to draw the picture that is asked for at `now`."""
-        if now - self.moved < SETTLE:
+        if not self._settled(now):
             reduce, lod = STEPS[self.step]
             return Quality(reduce, lod)
         return FINE if self.shown >= 1 and self._fine_is_fast else FULL
+
+    def _settled(self, now: float) -> bool:
+        return now - self.moved >= SETTLE - 1e-6
 
     @property
     def _fine_is_fast(self) -> bool:
@@ -55,7 +58,7 @@ class Pace:
         """Return the pace after a picture has been drawn in `seconds`."""
         if quality == FINE:
             return replace(self, shown=2)
-        if quality == FULL and now - self.moved >= SETTLE:
+        if quality == FULL and self._settled(now):
             return replace(self, shown=1, full_seconds=seconds)
         step = self.step
         if seconds > BUDGET:

@@ -138,6 +138,7 @@ def listening(host: str, port: int) -> socket.socket:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind(address)
+            listener.listen(128)  # who comes before the server runs waits
         except OSError:
             listener.close()
             raise

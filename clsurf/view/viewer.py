@@ -219,11 +219,13 @@ class Viewer:
         return pixels
 
     def _written(self, pixels: NDArray, reduce: int) -> NDArray:
-        hint = "h: help" if self.hint else ""
-        if reduce > 1 and (self.state.help or self.state.words or hint or self.state.picks):
+        state, hint = self.state, "h: help" if self.hint else ""
+        if reduce > 1 and (state.help or state.picks):
             # Letters are to stay readable: the picture gets its full size first.
             pixels = pixels.repeat(reduce, axis=0).repeat(reduce, axis=1)[:self.size[1], :self.size[0]]
-        return picture.written(pixels, self.state, HELP, hint)
+        elif reduce > 1:
+            state, hint = replace(state, words=""), ""
+        return picture.written(pixels, state, HELP, hint)
 
     def close(self) -> None:
         """Give the device memory back. May be called twice."""

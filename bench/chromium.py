@@ -1,17 +1,15 @@
-"""A headless Chromium that tests steer over its debugging connection, and what they look for in it."""
+"""A headless Chromium, steered over its debugging connection."""
 
 import base64
 import io
 import itertools
 import json
-import os
 import shutil
 import subprocess
 import time
 import urllib.request
 
 import numpy as np
-import pytest
 from PIL import Image
 from websockets.sync.client import connect
 
@@ -21,12 +19,9 @@ FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-
          "--remote-debugging-port=0", "--remote-allow-origins=*")
 
 
-def browser_path() -> str:
-    """Return a headless browser's path; without one, checks of every change fail, elsewhere the test is skipped."""
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        (pytest.fail if os.environ.get("CI") else pytest.skip)("needs a browser: apt-get install chromium")
-    return found
+def browser_path() -> str | None:
+    """Return a browser's path, None without one."""
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
 class Browser:
