@@ -22,10 +22,12 @@ from .errors import Error
 from .io import load, load_frames, save
 from .render.camera import Camera
 from .render.frame import Frame
+from .render.light import Light
+from .render.material import Material
 from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
 from .render.scene import Scene
-from .render.shade import Light, Shading
+from .render.shade import Shading
 from .render.slim_drawing import SlimDrawing
 from .report.page import report
 from .surface.cloud import PointCloud
@@ -39,9 +41,9 @@ from .trace.hits import Hits, trace
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
-    "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
+    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Material", "Mesh", "PatchDrawing",
+    "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene",
+    "Shading", "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature",
+    "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
     "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
 ]

@@ -75,6 +75,14 @@ __kernel void tile_patches(__global const float *view, __global const short *box
   tile = spread_tile(tile, tile_count);
   int width = (int)view[WIDTH], height = (int)view[HEIGHT];
   int bin_x = tile % tiles_x * TILE_BINS, bin_y = tile / tiles_x * TILE_BINS;
+#if MASKED
+  int wanted = 0;
+  for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
+    int x = bin_x + i % TILE_BINS, y = bin_y + i / TILE_BINS;
+    wanted |= x < bins_x && y < bins_y && WANTED(y * bins_x + x);
+  }
+  if (!wanted) return;
+#endif
   to.x = bin_x * BIN; to.y = bin_y * BIN;
   to.slots = slots;
   to.cost = cost;
