@@ -61,7 +61,7 @@ def test_mark_edges(device, lanes, camera):
     arrays = {name: device.upload(plain.channels[name]) for name in ("depth", "normal", "id")}
     grid = Grid(SIZE, 4, Layout(), None, None)
     edges, large = mark_edges(device, Scratch(device, lanes), grid, device.upload(view_floats(camera, SIZE)), arrays,
-                              edge_layout(Layout(), 1), 4)
+                              edge_layout(Layout(), 1))
     got, wanted = device.download(edges).astype(bool), edges_of(plain, camera)
     assert (got != wanted).sum() <= 2
     bins = device.download(large.touched).reshape(large.bins_y, large.bins_x)

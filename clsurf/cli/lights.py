@@ -17,7 +17,7 @@ OcclusionOption = Annotated[int, typer.Option(help="Directions of ambient occlus
 SkyOption = Annotated[str, typer.Option(help="Light from all around: sky, overcast, studio, or an equirectangular "
                                         "picture (.exr, .hdr, .png, .jpg); with ,DEGREES after it: turned about --up.")]
 MaterialOption = Annotated[str, typer.Option(help="plastic, matte, metal, gold or copper, lit by --sky and --light; "
-                                             "clay, pearl, jade, bronze, chrome or the picture of a lit sphere: a matcap.")]
+                                             "matcaps: clay, pearl, jade, bronze, chrome, a picture of a lit sphere.")]
 MirrorOption = Annotated[float, typer.Option(help="Share of mirror reflection, 0 to 1.")]
 
 WARM, COOL = ((-1.0, 1.2, 1.0), (0.85, 0.76, 0.66)), ((1.0, 0.7, 1.2), (0.30, 0.35, 0.45))

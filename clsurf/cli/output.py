@@ -9,7 +9,7 @@ import typer
 from ..errors import InputError
 
 BackgroundOption = Annotated[str, typer.Option(help="Colour r,g,b[,alpha] (0 to 1) or #rrggbb; two with a colon "
-                                               "between: from top to bottom; transparent; sky: that of --sky; or a picture "
+                                               "between: from top to bottom; transparent; sky: of --sky; a picture "
                                                "[white].")]
 AntialiasOption = Annotated[str, typer.Option(help="none; coverage: edges with 4x4 samples; supersample: everything.")]
 ToneOption = Annotated[str, typer.Option(help="Curve that takes bright light into a .png or .jpg: none (clipped), "

@@ -14,6 +14,7 @@ from .tiles import BIN, Grid, Layout, Scratch
 ANTIALIAS = ("none", "coverage", "supersample")
 FACTOR = 4  # samples along each side of an edge's pixel
 SPAN = 64
+PATCH_BINS = 4  # across a tile of patches: an edge's tile is drawn whole
 
 
 def checked_antialias(antialias, supersampling) -> tuple[int, bool]:
@@ -38,7 +39,7 @@ def edge_layout(layout: Layout, materials: int) -> Layout:
 
 
 def mark_edges(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, arrays: dict[str, DeviceArray],
-               layout: Layout, patch_bins: int) -> tuple[DeviceArray, Grid]:
+               layout: Layout) -> tuple[DeviceArray, Grid]:
     """Return which pixels hold an edge, (h, w) uint8, and the bins of the picture 4 times as large that are wanted.
 
     Parameters
@@ -57,11 +58,12 @@ def mark_edges(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, 
     device.check_memory(planes=4 * 64 * fields * bins_x * bins_y)
     edges = scratch.array("edges", (height, width), np.uint8)
     touched = scratch.array("touched", (bins_x * bins_y,), np.int32)
-    device.kernel("render/mark_edges.cl", constants={"FACTOR": FACTOR, "SPAN": SPAN, "HAS_ID": "id" in arrays})(
+    device.kernel("render/mark_edges.cl", constants={
+        "VW": scratch.lanes, "FACTOR": FACTOR, "SPAN": SPAN, "HAS_ID": "id" in arrays})(
         (-(-width // SPAN), bins_y), None, view, arrays["depth"], arrays["normal"], arrays.get("id", arrays["depth"]),
         width, height, bins_x, bins_y, edges, touched)
     planes = scratch.array("planes", (bins_x * bins_y, fields, 64), np.float32)
-    return edges, Grid(large, grid.tile_bins, layout, touched, planes, patch_bins, masked=True)
+    return edges, Grid(large, grid.tile_bins, layout, touched, planes, PATCH_BINS, masked=True)
 
 
 def cover_edges(device: Device, large: Grid, edges: DeviceArray, background: DeviceArray, color: DeviceArray) -> None:

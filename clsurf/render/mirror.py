@@ -25,7 +25,9 @@ POINT_FLOATS, SPAN = 16, 64  # kernels/render/light_points.cl
 
 def wants_mirror(scene, shading: Shading, channels) -> bool:
     """Return whether a picture shows reflections."""
-    return "color" in channels and bool(np.any(mirror_shares(scene, shading) > 0))
+    if "color" not in channels or (scene.materials is None and np.ndim(shading.mirror) == 0 and not shading.mirror):
+        return False
+    return bool((mirror_shares(scene, shading) > 0).any())
 
 
 def mirror_shares(scene, shading: Shading) -> NDArray:

@@ -178,7 +178,7 @@ class Renderer:
                                "phong" if early else shading.look, channels)
             if covered:
                 edges, large = mark_edges(self.device, self._scratch, grid, self.device.upload(whole), arrays,
-                                          edge_layout(grid.layout, len(lighting.materials)), self._patch_bins(size))
+                                          edge_layout(grid.layout, len(lighting.materials)))
                 self._draw(large, scene, camera, replace(look, lod=FACTOR * lod, cost=False), floats, lighting)
                 cover_edges(self.device, large, edges, self.device.upload(floats[8:12]), arrays["color"])
             if mirrored:
@@ -223,16 +223,13 @@ class Renderer:
         self.device.check_memory(planes=4 * 64 * fields * bins * (not at_once),
                                  differentials=4 * layout.differential_planes * pixels,
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
-        patch_bins = self._patch_bins(size)
+        patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
         if at_once:
             return Grid(size, self.tile_bins, layout, None, None, patch_bins)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
         return Grid(size, self.tile_bins, layout, touched,
                     self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins)
-
-    def _patch_bins(self, size) -> int:
-        return self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
 
     def _uploaded(self, surface):
         upload = self._uploads.get(surface)
