@@ -30,7 +30,7 @@ class Output:
 
     def save(self, frame, path: Path) -> None:
         """Write a frame."""
-        frame.save(path, self.tone, self.exposure, self.bits, dither=False)
+        frame.save(path, self.tone, self.exposure, self.bits)
 
 
 def output(path: Path, background: str, antialias: str, supersampling: int, tone: str, exposure: float, bits: int,

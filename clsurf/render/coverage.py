@@ -4,6 +4,8 @@ Kernels: mark_edges.cl, cover_edges.cl. What draws them is the same tile stages,
 edge: against `supersampling=4`, edges are as good and frames several times faster.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..device import Device, DeviceArray
@@ -35,7 +37,7 @@ def edge_channels(channels, surfaces: int) -> list[str]:
 
 def edge_layout(layout: Layout, materials: int) -> Layout:
     """Return the planes of the picture of the edges of one with the planes `layout`."""
-    return Layout(color=True, id=materials > 1, lit=layout.lit, traced=True)
+    return replace(layout, color=True, id=materials > 1, count=False, level=False, traced=True, differentials=())
 
 
 def mark_edges(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, arrays: dict[str, DeviceArray],
@@ -63,7 +65,8 @@ def mark_edges(device: Device, scratch: Scratch, grid: Grid, view: DeviceArray, 
         (-(-width // SPAN), bins_y), None, view, arrays["depth"], arrays["normal"], arrays.get("id", arrays["depth"]),
         width, height, bins_x, bins_y, edges, touched)
     planes = scratch.array("planes", (bins_x * bins_y, fields, 64), np.float32)
-    return edges, Grid(large, grid.tile_bins, layout, touched, planes, PATCH_BINS, masked=True)
+    return edges, replace(grid, size=large, layout=layout, touched=touched, planes=planes, patch_bins=PATCH_BINS,
+                          masked=True)
 
 
 def cover_edges(device: Device, large: Grid, edges: DeviceArray, background: DeviceArray, color: DeviceArray) -> None:

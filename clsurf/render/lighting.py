@@ -24,6 +24,7 @@ from .sky import Sky, prepared_sky
 from .tiles import Grid, Scratch, view_floats
 
 MATERIAL_FLOATS, SKY_FLOATS = 16, 48  # kernels/render/materials.clh
+OWN_COLORS = ("colors", "color", "vertex_colors", "texture")  # where surfaces have colours of their own
 KEPT = 8  # prepared pictures and sets of texels of each kind that a device keeps
 
 
@@ -92,7 +93,7 @@ def surface_shading(scene, shading: Shading, number: int) -> Shading:
     """Return the shading by which a surface's own colours go into the planes."""
     material = scene.surface_materials[number]
     surface = scene.placed[number][0]
-    own = shading.model_colors and (surface.colors is not None or getattr(surface, "color", None) is not None)
+    own = shading.model_colors and any(getattr(surface, name, None) is not None for name in OWN_COLORS)
     if material is not None and material.color is not None and not shading.look.startswith("ball"):
         return replace(shading, color=material.color, model_colors=False)
     look = shading.look if material is None else material.look

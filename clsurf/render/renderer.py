@@ -99,8 +99,8 @@ class Renderer:
             8 a fast mode that shows, 0 draws the leaves only.
         background : 3 or 4 floats, two of those, str, path, array or Light
             A colour, sRGB with straight alpha, 0 to 1; two: a gradient from top to bottom; "transparent"; "sky": the
-            scene's image light itself; an image light that need not be in the scene; a picture, file or array (h, w,
-            3), that fills the frame.
+            scene's image light itself (orthographic cameras see one place of it); an image light that need not be in
+            the scene; a picture, file or array (h, w, 3), that fills the frame.
         supersampling : int
             1 to 4: samples along each side of a pixel. The picture is drawn that much larger, so thresholds in pixels
             count samples; "color" is the mean, every other channel that of the sample at the pixel's centre, or, for 2
