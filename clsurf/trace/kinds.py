@@ -12,7 +12,7 @@ from ..device import Device, DeviceArray
 from ..errors import InputError
 
 CLOSEST, ANY, NEXT = 0, 1, 2  # kernels/trace/ray_walk.clh, MODE
-RAYS_OF_ITEM = 64  # rays that one work-item of a CPU device traces
+RAYS_OF_ITEM = 128
 
 
 @dataclass(frozen=True, eq=False)

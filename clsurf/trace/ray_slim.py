@@ -1,4 +1,4 @@
-"""SLIM surfaces for single rays: leaves in blocks of 16, one lane each. Kernel: kernels/trace/ray_slim.cl."""
+"""SLIM surfaces for single rays: a record for each leaf. Kernel: kernels/trace/ray_slim.cl."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,22 +20,22 @@ def trace_slim(device: Device, surface: SlimSurface) -> Traced:
     if not (tree.order >= 0).any():
         return Traced(surface.origin, 1.0, NOTHING, lambda *_: None)
     planes = device.download(base.surfels)  # x y z r r, normal, low high slope, coefficients
-    empty = tree.order.reshape(-1, WIDTH) < 0
-    z = planes[:, 7].astype(np.float64)
-    turn = -1 / (np.copysign(1.0, z) + z)
-    blocks = np.concatenate([planes[:, :3], planes[:, 5:8], turn[:, None], 1 / planes[:, 3:4], planes[:, 3:4],
-                             planes[:, 11:11 + count]], axis=1).astype(np.float32)
-    blocks[:, :3] = np.where(empty[:, None], FAR, blocks[:, :3])
-    feet = np.ascontiguousarray(device.download(base.tails)[:, 8:10]).view(np.uint32)
-    feet = np.ascontiguousarray(feet.reshape(-1, WIDTH, 2).transpose(0, 2, 1))
-    limited = (feet != 0xFFFFFFFF).any(axis=(1, 2)).astype(np.uint8)
+    balls = planes[:, :4].copy()
+    balls[:, :3] = np.where((tree.order < 0).reshape(-1, 1, WIDTH), FAR, balls[:, :3])
+    in_slots = planes.transpose(0, 2, 1).reshape(len(tree.order), -1)
+    records = np.zeros((len(tree.order), 16 if surface.degree < 3 else 32), np.float32)
+    records[:, :7], records[:, 7] = in_slots[:, [0, 1, 2, 3, 5, 6, 7]], 1 / in_slots[:, 3]
+    records[:, 8:8 + min(count, 6)] = in_slots[:, 11:11 + min(count, 6)]
+    records[:, 14:16] = device.download(base.tails)[:, 8:10]
+    if count > 6:
+        records[:, 16:20] = in_slots[:, 17:21]
     top = device.download(base.boxes)[0]
     box = np.stack([top[:3].min(axis=1), top[3:].max(axis=1)]).astype(np.float64)
     margin = 1e-3 * float((box[1] - box[0]).max())
     leaves = np.flatnonzero(surface.leaf) if surface.leaf.any() else np.arange(len(surface))  # what the tree holds
     numbers = np.where(tree.order >= 0, leaves[tree.order], -1).astype(np.int32)
     lists = neighbour_lists(tree, device.download(base.boxes), device.download(base.balls))
-    arrays = [device.upload(array) for array in (blocks, feet, limited, numbers, *lists)]
+    arrays = [device.upload(array) for array in (records, balls, numbers, *lists)]
 
     def launch(mode, rays_count, rays, hits):
         size, group, batch = items(device, rays_count)

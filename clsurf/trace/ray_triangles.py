@@ -53,8 +53,11 @@ def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Trac
         raise InputError(f"mesh: expected at most {LARGEST_COUNT:,} faces to trace, got {len(mesh.faces):,}: split it")
     bottoms = 16 * -(-len(mesh.faces) // WIDTH) / 15
     device.check_memory(triangles=int(bottoms * 36 * WIDTH), nodes=int(bottoms * 24 * WIDTH / 15))
-    finite = np.isfinite(mesh.vertices).all(axis=1)
-    kept = np.flatnonzero(finite[mesh.faces].all(axis=1))
+    finite = np.isfinite(mesh.vertices)
+    kept = np.arange(len(mesh.faces))
+    if not finite.all():
+        whole = finite.all(axis=1)[mesh.faces]
+        kept = np.flatnonzero(whole.all(axis=1))
     if not len(kept):
         return Traced(mesh.origin, 1.0, NOTHING, lambda *_: None)
     faces = mesh.faces[kept]
@@ -65,8 +68,10 @@ def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Trac
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else max(float(np.abs(middle).max()), 1.0)
     corners = ((mesh.vertices.astype(np.float64) - middle) / unit).astype(np.float32)[faces]
-    below, above = corners.min(axis=1).astype(np.float64) - MARGIN, corners.max(axis=1).astype(np.float64) + MARGIN
-    tree = plant(below, above)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    below = np.minimum(np.minimum(a, b), c) - np.float32(MARGIN)
+    above = np.maximum(np.maximum(a, b), c) + np.float32(MARGIN)
+    tree = plant(device, below, above)
     blocks = tree.in_slots(corners.reshape(-1, 9), FAR).reshape(-1, WIDTH, 9).transpose(0, 2, 1)
     order = kept if numbers is None else numbers[kept]
     arrays = [device.upload(node_boxes(tree, below, above)), device.upload(np.ascontiguousarray(blocks)),
