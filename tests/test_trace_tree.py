@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from reference import trace_tree as reference
 
 from clsurf.trace.tree import EMPTY, WIDTH, node_boxes, plant
-from reference import trace_tree as reference
 
 COUNTS = (0, 1, 16, 17, 100, 256, 257, 4097)
 

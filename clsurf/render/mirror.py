@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
-from ..surface.srgb import LINEAR_OF_BYTE, to_linear
+from ..surface.srgb import to_linear
 from ..trace.hits import Hits, trace
+from ..trace.kinds import traced
 from .shade import Shading
 
 CHANNELS = ("position", "normal", "id")  # that a picture needs for it
@@ -28,14 +29,9 @@ def mirror_shares(shading: Shading, count: int) -> NDArray:
     return np.full(count, shares) if shares.ndim == 0 else np.resize(np.append(shares, np.zeros(count)), count)
 
 
-def grain(surface, matrix) -> float:
+def grain(device: Device, surface, matrix) -> float:
     """Return the length (world units) within which a surface's own points are no obstacles to rays from it."""
-    scale = 1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if hasattr(surface, "radii"):
-        own = surface.radii[surface.leaf] if surface.leaf.any() else surface.radii
-    else:
-        own = np.linalg.norm(surface.axis_x, axis=1)
-    return scale * float(np.median(own)) if len(own) else 0.0
+    return (1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))) * traced(device, surface).grain
 
 
 def reflect(device: Device, scene, camera, shading: Shading, background: NDArray, origin: NDArray,
@@ -45,7 +41,7 @@ def reflect(device: Device, scene, camera, shading: Shading, background: NDArray
     `arrays` are the picture's channels on the device, `position` relative to `origin` (3,) float64.
     """
     number = device.download(arrays["id"])
-    shares, grains = mirror_shares(shading, len(scene.placed)), [grain(*part) for part in scene.placed]
+    shares, grains = mirror_shares(shading, len(scene.placed)), [grain(device, *part) for part in scene.placed]
     use = number >= 0
     use[use] = shares[number[use]] > 0
     if not use.any():
@@ -72,8 +68,8 @@ def lit(device: Device, scene, camera, shading: Shading, hits: Hits, rays: NDArr
     hit = hits.hit
     points, normals, eye = hits.position[hit], hits.normal[hit], -rays[hit]
     surface, primitive = hits.surface[hit], hits.primitive[hit]
-    base = base_colors(scene, shading, surface, primitive)
-    step = np.array([grain(*part) for part in scene.placed])[surface]
+    base = base_colors(device, scene, shading, surface, primitive)
+    step = np.array([grain(device, *part) for part in scene.placed])[surface]
     color = shading.ambient * base
     for light in scene.lights:
         to = np.broadcast_to(np.asarray(light.vector, np.float64), points.shape)
@@ -98,19 +94,11 @@ def lit(device: Device, scene, camera, shading: Shading, hits: Hits, rays: NDArr
     return color
 
 
-def base_colors(scene, shading: Shading, surface: NDArray, primitive: NDArray) -> NDArray:
-    """Return the linear colours (n, 3) of what was hit: a surfel's, or the mean of a patch's."""
+def base_colors(device: Device, scene, shading: Shading, surface: NDArray, primitive: NDArray) -> NDArray:
+    """Return the linear colours (n, 3) of what was hit: a surfel's, a face's, or the mean of a patch's."""
     out = np.tile(to_linear(shading.color), (len(surface), 1))
     for number, (own, _) in enumerate(scene.placed):
-        here = surface == number
-        if not shading.model_colors or not here.any():
-            continue
-        if own.colors is not None and hasattr(own, "radii"):
-            out[here] = LINEAR_OF_BYTE[own.colors[primitive[here], :3]]
-        elif own.colors is not None:
-            linear = LINEAR_OF_BYTE[own.colors[:, :3]]
-            mean = np.add.reduceat(linear, own.node_offset[:-1], axis=0) / np.diff(own.node_offset)[:, None]
-            out[here] = mean[primitive[here]]
-        elif getattr(own, "color", None) is not None:
-            out[here] = LINEAR_OF_BYTE[own.color]
+        here, colors = surface == number, traced(device, own).colors
+        if shading.model_colors and colors is not None and here.any():
+            out[here] = colors(primitive[here])
     return out
