@@ -51,7 +51,7 @@ class Traced:
     colors: Callable[[NDArray], NDArray] | None = None
 
     def __post_init__(self):
-        if self.grain is None:
+        if self.grain is None or not np.isfinite(self.grain):
             diagonal = 0.0 if self.empty else float(np.linalg.norm(self.box[1] - self.box[0]))
             object.__setattr__(self, "grain", 1e-3 * self.unit * diagonal)
 
