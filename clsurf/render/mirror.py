@@ -19,7 +19,10 @@ LIFT, START = 0.05, 0.5
 
 def wants_mirror(shading: Shading, channels) -> bool:
     """Return whether a picture shows reflections."""
-    return bool(np.any(np.asarray(shading.mirror) > 0)) and shading.look == "phong" and "color" in channels
+    if shading.look != "phong" or "color" not in channels:
+        return False
+    share = shading.mirror
+    return share > 0 if isinstance(share, float) else bool(np.any(np.asarray(share) > 0))
 
 
 def mirror_shares(shading: Shading, count: int) -> NDArray:

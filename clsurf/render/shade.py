@@ -1,12 +1,13 @@
 """Shading: material, lights, background, and the last stage, which writes the channels of the picture."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
-from ..surface.srgb import to_linear
+from ..surface.srgb import linear_color
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
 from .slim_drawing import SlimDrawing
@@ -140,16 +141,31 @@ class Look:
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
     """Return the shading buffer of kernels/render/shade.cl; positions and directions in view space.
 
-    `background` is sRGB with straight alpha, 3 or 4 values from 0 to 1.
+    `background` is sRGB with straight alpha, 3 or 4 values from 0 to 1. The result is read-only: under headlights alone
+    it does not depend on the camera and is looked up.
     """
+    if all(light.kind == "headlight" for light in lights):
+        try:
+            return _same_light(shading, tuple(lights), tuple(background))
+        except TypeError:  # a list among them
+            pass
+    return _shading_floats(shading, lights, background, camera)
+
+
+@lru_cache(maxsize=64)
+def _same_light(shading, lights, background):
+    return _shading_floats(shading, lights, background, None)
+
+
+def _shading_floats(shading, lights, background, camera):
     back = np.asarray(background, np.float64)
     if back.shape not in ((3,), (4,)) or not np.isfinite(back).all():
         raise InputError(f"background: expected 3 or 4 numbers from 0 to 1 (sRGB, alpha), got {background}")
     alpha = back[3] if len(back) == 4 else 1.0
     out = np.zeros(16 + 8 * len(lights), np.float32)
-    out[0:3] = to_linear(shading.color)
+    out[0:3] = linear_color(shading.color)
     out[3:8] = shading.ambient, shading.diffuse, shading.specular, shading.shininess, shading.stripes
-    out[8:11], out[11] = to_linear(back[:3]) * alpha, alpha
+    out[8:11], out[11] = linear_color(back[:3]) * alpha, alpha
     out[12] = len(lights)
     for i, light in enumerate(lights):
         vector = np.asarray(light.vector, np.float64)
@@ -158,6 +174,7 @@ def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
         elif light.kind == "point":
             vector = camera.rotation @ (vector - camera.eye)
         out[16 + 8 * i:24 + 8 * i] = KINDS[light.kind], *vector, *light.color, 0
+    out.flags.writeable = False
     return out
 
 
