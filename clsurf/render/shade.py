@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, field
 from os import PathLike
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
-from ..surface.srgb import to_linear
+from ..surface.srgb import linear_color
 from .differentials import NAME
 from .light import LIGHT_FLOATS, checked_numbers, light_floats
 from .light import Light as Light
@@ -123,19 +124,35 @@ class Look:
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
     """Return the shading buffer of kernels/render/shade.cl; positions and directions in view space.
 
-    `background` is sRGB with straight alpha, 3 or 4 values from 0 to 1.
+    `background` is sRGB with straight alpha, 3 or 4 values from 0 to 1. The result is read-only: under headlights alone
+    it does not depend on the camera and is looked up.
     """
+    if all(light.kind == "headlight" for light in lights):
+        try:
+            return _same_light(shading, tuple(lights), tuple(background))
+        except TypeError:  # a list among them
+            pass
+    return _shading_floats(shading, lights, background, camera)
+
+
+@lru_cache(maxsize=64)
+def _same_light(shading, lights, background):
+    return _shading_floats(shading, lights, background, None)
+
+
+def _shading_floats(shading, lights, background, camera):
     back = np.asarray(background, np.float64)
     if back.shape not in ((3,), (4,)) or not np.isfinite(back).all():
         raise InputError(f"background: expected 3 or 4 numbers from 0 to 1 (sRGB, alpha), got {background}")
     alpha = back[3] if len(back) == 4 else 1.0
     lamps = light_floats(lights, camera)
     out = np.zeros(HEAD_FLOATS + LIGHT_FLOATS * len(lamps), np.float32)
-    out[0:3] = to_linear(shading.color)
+    out[0:3] = linear_color(shading.color)
     out[3:8] = shading.ambient, shading.diffuse, shading.specular, shading.shininess, shading.stripes
-    out[8:11], out[11] = to_linear(back[:3]) * alpha, alpha
+    out[8:11], out[11] = linear_color(back[:3]) * alpha, alpha
     out[12] = len(lamps)
     out[HEAD_FLOATS:] = lamps.ravel()
+    out.flags.writeable = False
     return out
 
 

@@ -6,6 +6,7 @@ bin) with `bin_pairs` and writes the same planes, so that surfaces of all kinds 
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ class Layout:
         scalars, vectors = plane_counts(self.differentials)
         return scalars + 3 * vectors
 
-    @property
+    @cached_property
     def constants(self) -> dict[str, int]:
         """``FIELDS`` and ``FIELD_X`` as the kernels want them (kernels/common/planes.clh)."""
         out, at = {}, 4
