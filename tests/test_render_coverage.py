@@ -72,6 +72,36 @@ def test_mark_edges(device, lanes, camera):
     assert set(np.unique(bins)) == {-1, -2} and large.size == (4 * SIZE[0], 4 * SIZE[1])
 
 
+@pytest.mark.parametrize("lanes", (16, 8, 1))
+def test_what_an_edge_is(device, lanes):
+    """A fold is one from 35 degrees on; a step of depth from one and a half pixels on, unless a plane goes on there."""
+    size, camera = (21, 9), Camera.orthographic((0, 0, 5), (0, 0, 0), height=9)  # a pixel is a unit wide
+    grid, view = Grid(size, 4, Layout(), None, None), device.upload(view_floats(camera, size))
+
+    def columns(depth, normal, number=None):
+        arrays = {"depth": depth, "normal": normal} | ({} if number is None else {"id": number})
+        arrays = {name: device.upload(np.tile(a, (9, *a.ndim * (1,)))) for name, a in arrays.items()}
+        edges, _ = mark_edges(device, Scratch(device, lanes), grid, view, arrays, edge_layout(Layout(), 1))
+        edges = device.download(edges)
+        assert (edges == edges[0]).all()
+        return np.flatnonzero(edges[0]).tolist()
+
+    def facing(degrees):
+        a = np.radians(degrees) * np.ones(21)
+        return np.stack([np.sin(a), np.zeros(21), np.cos(a)], axis=1).astype(np.float32)
+
+    flat, right = np.full(21, 5, np.float32), np.arange(21) >= 8
+    assert columns(flat, facing(0)) == []
+    for degrees, wanted in ((30, []), (40, [7, 8])):
+        assert columns(flat, np.where(right[:, None], facing(degrees), facing(0))) == wanted
+    for step, wanted in ((1.4, []), (1.7, [7, 8]), (-1.7, [7, 8]), (np.nan, [7, 8])):
+        assert columns(np.where(right, flat + np.float32(step), flat), facing(0)) == wanted
+    slope = (5 + 3 * np.arange(21)).astype(np.float32)
+    tilt = -np.degrees(np.arctan(3))
+    assert columns(slope, facing(-tilt)) == [] and len(columns(slope, facing(tilt))) == 21
+    assert columns(flat, facing(0), right.astype(np.int32)) == [7, 8]
+
+
 @pytest.mark.parametrize("angle", (3, 17, 40, 73))
 def test_edge_of_a_half_plane(device, angle):
     """What a straight edge covers of its pixels, to what 16 samples can tell: none of its pixels is forgotten."""
