@@ -54,8 +54,8 @@ __all__ = [
     "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Material", "Mesh",
     "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan",
     "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface", "SurfaceError",
-    "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim", "build_surfels", "color_map",
-    "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load",
+    "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim", "build_surfels",
+    "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load",
     "load_cameras", "load_frames", "models", "open_device", "project", "render", "render_frames", "report", "save",
     "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable", "view", "write_video",
 ]

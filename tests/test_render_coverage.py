@@ -7,6 +7,7 @@ from reference.patch_scenes import globe
 from reference.surfaces import sphere
 from test_render_supersampling import half_plane
 
+import clsurf
 from clsurf.errors import InputError
 from clsurf.render.camera import Camera
 from clsurf.render.coverage import FACTOR, edge_layout, mark_edges
@@ -165,3 +166,31 @@ def test_nothing_to_see(device):
 def test_wrong_options_say_what_is_expected(device, wrong):
     with Renderer(device) as r, pytest.raises(InputError, match="antialias"):
         r.render(sphere(20), None, (8, 8), **wrong)
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+@pytest.mark.parametrize("kind", ("mesh", "scale map", "surfels"))
+def test_every_representation(device, lanes, kind):
+    """The same promise for what has tiles of its own: edges as with 4 x 4 samples, the rest untouched."""
+    mesh = ball_mesh()
+    surface = {"mesh": lambda: mesh, "scale map": lambda: clsurf.build_scale_map(mesh, size=16, device=device),
+               "surfels": lambda: clsurf.build_surfels(mesh, device=device)}[kind]()
+    with Renderer(device, lanes=lanes) as r:
+        plain, got, fine = (r.render(Scene([surface], [Light()], Material("flat", (0.2, 0.4, 0.6))), CAMERA, SIZE,
+                                     ("color", "depth", "normal", "id"), lod=0, antialias=a)
+                            for a in ("none", "coverage", "supersample"))
+    edges = edges_of(plain, CAMERA)
+    assert 60 < edges.sum() < 0.6 * edges.size
+    assert (np.abs(got.color - np.where(edges[..., None], fine.color, plain.color)).max(axis=2) > 1e-5).sum() <= 2
+
+
+def ball_mesh():
+    """A sphere of triangles."""
+    n = 24
+    down, around = np.pi * np.arange(n + 1) / n, 2 * np.pi * np.arange(2 * n) / (2 * n)
+    points = np.stack([np.outer(np.sin(down), np.cos(around)), np.outer(np.sin(down), np.sin(around)),
+                       np.outer(np.cos(down), np.ones(2 * n))], axis=-1).reshape(-1, 3)
+    i, j = (a.ravel() for a in np.mgrid[:n, :2 * n])
+    a, b = i * 2 * n + j, i * 2 * n + (j + 1) % (2 * n)
+    faces = np.concatenate([np.stack([a, a + 2 * n, b], axis=1), np.stack([b, a + 2 * n, b + 2 * n], axis=1)])
+    return clsurf.Mesh(points, faces[(faces[:, 0] >= 2 * n) | (faces[:, 1] >= 2 * n)])
