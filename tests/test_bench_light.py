@@ -4,6 +4,7 @@ import pytest
 
 from bench import light as job
 from bench.build import WrongAnswer
+from clsurf.render import renderer
 
 
 def test_quick_job(device, capsys):
@@ -18,7 +19,7 @@ def test_quick_job(device, capsys):
 
 
 def test_a_wrong_answer_stops_it(device, monkeypatch):
-    monkeypatch.setattr("clsurf.render.renderer.cover_edges", lambda *_: None)
+    monkeypatch.setattr(renderer, "cover_edges", lambda *_: None)
     case = job.QUICK_CASES[0]
     surface = job.built(job.scenes.scene(case.scene), 2, device)
     with pytest.raises(WrongAnswer, match="edges"):

@@ -7,6 +7,7 @@ from reference.patch_scenes import globe
 from reference.surfaces import sphere
 from test_render_supersampling import half_plane
 
+import clsurf
 from clsurf.errors import InputError
 from clsurf.render.camera import Camera
 from clsurf.render.coverage import FACTOR, edge_layout, mark_edges
@@ -72,6 +73,36 @@ def test_mark_edges(device, lanes, camera):
     assert set(np.unique(bins)) == {-1, -2} and large.size == (4 * SIZE[0], 4 * SIZE[1])
 
 
+@pytest.mark.parametrize("lanes", (16, 8, 1))
+def test_what_an_edge_is(device, lanes):
+    """A fold is one from 35 degrees on; a step of depth from one and a half pixels on, unless a plane goes on there."""
+    size, camera = (21, 9), Camera.orthographic((0, 0, 5), (0, 0, 0), height=9)  # a pixel is a unit wide
+    grid, view = Grid(size, 4, Layout(), None, None), device.upload(view_floats(camera, size))
+
+    def columns(depth, normal, number=None):
+        arrays = {"depth": depth, "normal": normal} | ({} if number is None else {"id": number})
+        arrays = {name: device.upload(np.tile(a, (9, *a.ndim * (1,)))) for name, a in arrays.items()}
+        edges, _ = mark_edges(device, Scratch(device, lanes), grid, view, arrays, edge_layout(Layout(), 1))
+        edges = device.download(edges)
+        assert (edges == edges[0]).all()
+        return np.flatnonzero(edges[0]).tolist()
+
+    def facing(degrees):
+        a = np.radians(degrees) * np.ones(21)
+        return np.stack([np.sin(a), np.zeros(21), np.cos(a)], axis=1).astype(np.float32)
+
+    flat, right = np.full(21, 5, np.float32), np.arange(21) >= 8
+    assert columns(flat, facing(0)) == []
+    for degrees, wanted in ((30, []), (40, [7, 8])):
+        assert columns(flat, np.where(right[:, None], facing(degrees), facing(0))) == wanted
+    for step, wanted in ((1.4, []), (1.7, [7, 8]), (-1.7, [7, 8]), (np.nan, [7, 8])):
+        assert columns(np.where(right, flat + np.float32(step), flat), facing(0)) == wanted
+    slope = (5 + 3 * np.arange(21)).astype(np.float32)
+    tilt = -np.degrees(np.arctan(3))
+    assert columns(slope, facing(-tilt)) == [] and len(columns(slope, facing(tilt))) == 21
+    assert columns(flat, facing(0), right.astype(np.int32)) == [7, 8]
+
+
 @pytest.mark.parametrize("angle", (3, 17, 40, 73))
 def test_edge_of_a_half_plane(device, angle):
     """What a straight edge covers of its pixels, to what 16 samples can tell: none of its pixels is forgotten."""
@@ -135,3 +166,31 @@ def test_nothing_to_see(device):
 def test_wrong_options_say_what_is_expected(device, wrong):
     with Renderer(device) as r, pytest.raises(InputError, match="antialias"):
         r.render(sphere(20), None, (8, 8), **wrong)
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+@pytest.mark.parametrize("kind", ("mesh", "scale map", "surfels"))
+def test_every_representation(device, lanes, kind):
+    """The same promise for what has tiles of its own: edges as with 4 x 4 samples, the rest untouched."""
+    mesh = ball_mesh()
+    surface = {"mesh": lambda: mesh, "scale map": lambda: clsurf.build_scale_map(mesh, size=16, device=device),
+               "surfels": lambda: clsurf.build_surfels(mesh, device=device)}[kind]()
+    with Renderer(device, lanes=lanes) as r:
+        plain, got, fine = (r.render(Scene([surface], [Light()], Material("flat", (0.2, 0.4, 0.6))), CAMERA, SIZE,
+                                     ("color", "depth", "normal", "id"), lod=0, antialias=a)
+                            for a in ("none", "coverage", "supersample"))
+    edges = edges_of(plain, CAMERA)
+    assert 60 < edges.sum() < 0.6 * edges.size
+    assert (np.abs(got.color - np.where(edges[..., None], fine.color, plain.color)).max(axis=2) > 1e-5).sum() <= 2
+
+
+def ball_mesh():
+    """A sphere of triangles."""
+    n = 24
+    down, around = np.pi * np.arange(n + 1) / n, 2 * np.pi * np.arange(2 * n) / (2 * n)
+    points = np.stack([np.outer(np.sin(down), np.cos(around)), np.outer(np.sin(down), np.sin(around)),
+                       np.outer(np.cos(down), np.ones(2 * n))], axis=-1).reshape(-1, 3)
+    i, j = (a.ravel() for a in np.mgrid[:n, :2 * n])
+    a, b = i * 2 * n + j, i * 2 * n + (j + 1) % (2 * n)
+    faces = np.concatenate([np.stack([a, a + 2 * n, b], axis=1), np.stack([b, a + 2 * n, b + 2 * n], axis=1)])
+    return clsurf.Mesh(points, faces[(faces[:, 0] >= 2 * n) | (faces[:, 1] >= 2 * n)])

@@ -1,8 +1,9 @@
 """Shading: how all surfaces look, the background, and the last stage, which writes the channels of the picture."""
 
 from dataclasses import dataclass, field
-from os import PathLike
 from functools import lru_cache
+from os import PathLike
+
 
 import numpy as np
 from numpy.typing import NDArray

@@ -63,13 +63,13 @@ class Grid:
     planes: DeviceArray | None  # (bins, FIELDS, 64) float32; None where the picture is shaded without them
     patch_bins: int = 4  # bins across a tile of patches
     clip: NDArray | None = None  # (n, 4) float64: clip planes, view space
+    masked: bool = False  # whether `touched` is -2 where a bin is not wanted: stages may leave it out
 
     def clip_into(self, view: NDArray) -> NDArray:
         """Write the clip planes into a view buffer (VIEW_FLOATS,) float32 and return it."""
         if self.clip is not None and len(self.clip):
             view[CLIP:CLIP + self.clip.size] = self.clip.ravel()
         return view
-    masked: bool = False  # whether `touched` is -2 where a bin is not wanted: stages may leave it out
 
     @property
     def bins_x(self) -> int:
