@@ -16,6 +16,7 @@ JOBS = {
     "normals": "neighbours, normals and their orientation",
     "curvature": "curvature at points: error and time on tori, MeshLab's filters",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
+    "surfels": "surfel hierarchies: normal maps against float64, builds, normals by map size, frames beside SLIM",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 

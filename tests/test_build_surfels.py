@@ -203,7 +203,8 @@ def test_normal_maps_of_a_sphere_are_its_normals(device):
         inside = (got[:, 3] > 0) & ((flat**2).sum(axis=1) < 0.8)
         high = np.sqrt(1 - (flat**2).sum(axis=1, where=inside[:, None], initial=0))
         exact = flat + high[:, None] * n
-        assert np.sqrt((twin.angles(got[inside], exact[inside]) ** 2).mean()) < 0.6  # the points stand 0.6 degrees apart
+        # The points stand 0.6 degrees apart.
+        assert np.sqrt((twin.angles(got[inside], exact[inside]) ** 2).mean()) < 0.6
 
 
 def test_kernel_forms_give_the_same_maps(form, device):

@@ -36,8 +36,8 @@ class SurfaceError:
     Attributes
     ----------
     distance : (n,) float64
-        From every finite point of the scan to the surface. From SLIM surfaces and surfel hierarchies signed, positive on the side that the
-        normals point to; from meshes and patches 0 or more.
+        From every finite point of the scan to the surface. From SLIM surfaces and surfel hierarchies signed, positive
+        on the side that the normals point to; from meshes and patches 0 or more.
     diagonal : float
         Of the scan's bounding box without outliers, world units: what `relative` divides by.
     backward : SurfaceError or None
@@ -94,7 +94,8 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
     Parameters
     ----------
     surface : SlimSurface, PatchSurface, SurfelHierarchy, Mesh or Placed
-        SLIM surfaces and hierarchies are projected onto (see `project`); of patches, the triangles between opaque nodes count.
+        SLIM surfaces and hierarchies are projected onto (see `project`); of patches, the triangles between opaque nodes
+        count.
     scan : Mesh, PointCloud, RangeScan, (n, 3) array_like of world positions, or the path of a scan
         Points that are not finite are left out.
     both : bool
@@ -113,7 +114,8 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
         A scan without finite points, a surface without leaves or faces, or `both` without triangles in the scan.
     """
     scan = _as_scan(scan)
-    if not isinstance(surface.surface if isinstance(surface, Placed) else surface, SlimSurface | PatchSurface | SurfelHierarchy | Mesh):
+    own = surface.surface if isinstance(surface, Placed) else surface
+    if not isinstance(own, SlimSurface | PatchSurface | SurfelHierarchy | Mesh):
         raise InputError("surface: expected a SlimSurface, a PatchSurface, a SurfelHierarchy or a Mesh, got "
                          f"{type(surface).__name__}")
     if both and not (isinstance(scan, Mesh) and len(scan.faces)):
