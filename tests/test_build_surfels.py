@@ -300,7 +300,7 @@ def test_what_cannot_be_built_is_refused(device):
         build_surfels([1], device=device)
     with pytest.raises(DeviceMemoryError, match="memory_limit"):
         build_surfels(sphere(1000), memory_limit="100kB", device=device)
-    with pytest.raises(InputError, match="spacing: expected with hybrid"):
+    with pytest.raises(InputError, match="spacing: expected without hybrid"):
         build_surfels(uv_sphere(6, 6), hybrid=True, spacing=1.0, device=device)
     flat = Mesh(np.zeros((3, 3), np.float32), [[0, 1, 2]])
     with pytest.raises(InputError, match="face with an area"):

@@ -7,8 +7,8 @@ from ..errors import InputError
 from ..surface.mesh import Mesh
 from .lattice import GOLDEN
 
-LUMPS = ((1.3, 0.22), (2.6, 0.10), (5.0, 0.035))  # cycles a radius and height over the radius, of the shape
-ROUGH = ((14.0, 0.010), (31.0, 0.0045), (67.0, 0.0020), (140.0, 0.0009))  # of the ground
+LUMPS = ((0.35, 0.15), (0.8, 0.07), (1.8, 0.028))  # cycles a radius and height over the radius, of the shape
+ROUGH = ((5.0, 0.008), (11.0, 0.004), (24.0, 0.0018), (52.0, 0.0008))  # of the ground
 WAVES = 24  # directions that every size of relief is a sum over
 
 
