@@ -23,9 +23,12 @@ from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
 from ..surface.placed import Placed
 from ..surface.ranges import RangeScan
+from ..surface.scale_map import ScaleMap
+from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import SlimSurface, frame_of_normals
 from ..surface.surfel import SurfelHierarchy
 
+MEASURED = SlimSurface | PatchSurface | SurfelHierarchy | ScaleMap
 ALPHA = 2 / 3  # of a ball's radius: the part that carries the surface
 
 
@@ -93,9 +96,9 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
 
     Parameters
     ----------
-    surface : SlimSurface, PatchSurface, SurfelHierarchy, Mesh or Placed
+    surface : SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh or Placed
         SLIM surfaces and hierarchies are projected onto (see `project`); of patches, the triangles between opaque nodes
-        count.
+        count, of scale maps those between valid texels.
     scan : Mesh, PointCloud, RangeScan, (n, 3) array_like of world positions, or the path of a scan
         Points that are not finite are left out.
     both : bool
@@ -114,10 +117,9 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
         A scan without finite points, a surface without leaves or faces, or `both` without triangles in the scan.
     """
     scan = _as_scan(scan)
-    own = surface.surface if isinstance(surface, Placed) else surface
-    if not isinstance(own, SlimSurface | PatchSurface | SurfelHierarchy | Mesh):
-        raise InputError("surface: expected a SlimSurface, a PatchSurface, a SurfelHierarchy or a Mesh, got "
-                         f"{type(surface).__name__}")
+    if not isinstance(surface.surface if isinstance(surface, Placed) else surface, MEASURED | Mesh):
+        raise InputError("surface: expected a SlimSurface, a PatchSurface, a SurfelHierarchy, a ScaleMap or a Mesh, "
+                         f"got {type(surface).__name__}")
     if both and not (isinstance(scan, Mesh) and len(scan.faces)):
         raise InputError("both: expected a scan with faces to measure the surface's points against, got points only")
     device = open_device(device)
@@ -141,7 +143,7 @@ def _as_scan(scan) -> Mesh | PointCloud:
         return scan.to_points()
     if isinstance(scan, Mesh | PointCloud):
         return scan
-    if isinstance(scan, SlimSurface | PatchSurface | SurfelHierarchy | Placed):
+    if isinstance(scan, MEASURED | Placed):
         raise InputError(f"scan: expected a scan, got a surface ({type(scan).__name__})")
     try:
         points = np.asarray(scan, np.float64)
@@ -165,7 +167,8 @@ def distances(surface, points: NDArray, device) -> NDArray:
 
 
 def _as_mesh(surface) -> Mesh:
-    mesh = patch_mesh(surface) if isinstance(surface, PatchSurface) else getattr(surface, "mesh", surface)
+    mesh = patch_mesh(surface) if isinstance(surface, PatchSurface) else \
+        scale_mesh(surface) if isinstance(surface, ScaleMap) else getattr(surface, "mesh", surface)
     if not len(mesh.faces):
         raise InputError("surface: expected a mesh with faces, got none")
     return mesh

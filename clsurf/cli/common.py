@@ -60,7 +60,7 @@ class Steps:
 def is_surface(thing) -> bool:
     """Return whether `thing` is a surface, and not a scan that one is built from."""
     import clsurf
-    return isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.SurfelHierarchy)
+    return isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.SurfelHierarchy | clsurf.ScaleMap)
 
 
 def checked_out(path: Path, endings=()) -> Path:

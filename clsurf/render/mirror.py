@@ -14,7 +14,7 @@ from ..trace.hits import Hits, trace
 from .shade import Shading
 
 CHANNELS = ("position", "normal", "id")  # that a picture needs for it
-# Where a ray starts, in node spacings of patches or median radii of surfels: up the normal, and along itself.
+# Where a ray starts, in node spacings of patches, texels or median radii of surfels: up the normal, and along itself.
 LIFT, START = 0.05, 0.5
 
 
@@ -38,8 +38,12 @@ def grain(surface, matrix) -> float:
         own = np.array([surface.spacing])
     elif hasattr(surface, "faces"):
         own = np.sqrt(longest2(surface.vertices, surface.faces[::max(1, len(surface.faces) // 20_000)]))
-    else:
+    elif hasattr(surface, "scales"):
+        return scale * surface.radius * 2 / surface.size
+    elif hasattr(surface, "axis_x"):
         own = np.linalg.norm(surface.axis_x, axis=1)
+    else:
+        own = np.linalg.norm(np.ptp(surface.bounds, axis=0), keepdims=True) / 500
     return scale * float(np.median(own)) if len(own) else 0.0
 
 

@@ -9,6 +9,7 @@ from ..errors import InputError
 from ..surface.srgb import to_linear
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
+from .scale_map_drawing import ScaleMapDrawing
 from .slim_drawing import SlimDrawing
 from .surfel_drawing import SurfelDrawing
 from .tiles import BIN, Grid, Scratch
@@ -134,9 +135,10 @@ class Look:
     lod: float
     patches: PatchDrawing
     slim: SlimDrawing
+    surfels: SurfelDrawing = field(default_factory=SurfelDrawing)
+    scale_map: ScaleMapDrawing = field(default_factory=ScaleMapDrawing)
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
-    surfels: SurfelDrawing = field(default_factory=SurfelDrawing)
 
 
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:

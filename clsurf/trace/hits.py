@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
-from . import ray_slim, ray_surfels, ray_triangles  # noqa: F401  they register their kinds
+from . import ray_scale_map, ray_slim, ray_surfels, ray_triangles  # noqa: F401  they register their kinds
 from .kinds import ANY, CLOSEST, NEXT, traced
 from .single import (
     HIT_FLOATS,
@@ -80,7 +80,7 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
 
     Parameters
     ----------
-    thing : SlimSurface, PatchSurface, SurfelHierarchy, Mesh, a placed one, a Scene, or a list of those
+    thing : SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, a placed one, a Scene, or a list of those
     origins, directions : (..., 3) array_like
         World space, float64; broadcast against each other. Directions need not be unit; a ray whose direction is zero
         or whose numbers are not finite misses.

@@ -59,6 +59,7 @@ __kernel void triangle_distances(int count, int query_stride, __global const flo
   for (int round = 0; round < 200; ++round) {
     float reach = s.extent + margin;
     best = 1e30f;
+    found = 0;
     traversal_start(&t, top_level);
     int blocks;
     while ((blocks = traversal_next(&t, boxes, node_offset, s.x, s.y, s.z, reach * reach, list)) > 0)

@@ -67,7 +67,7 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   VF inv_r = 1.0f / r;
   // The frame of the stored normal (common/frame.clh in lanes), turned into view space.
   VF nx = plane[NORMAL * step], ny = plane[(NORMAL + 1) * step], nz = plane[(NORMAL + 2) * step];
-  VF sign = SEL((VF)(1.0f), (VF)(-1.0f), AS_VI(nz) < 0);
+  VF sign = SIGN_OF(nz);
   VF a = -1.0f / (sign + nz), b = nx * ny * a;
   VF ax = 1.0f + sign * nx * nx * a, ay = sign * b, az = -sign * nx;
   VF bx = b, by = sign + ny * ny * a, bz = -ny;
