@@ -17,6 +17,7 @@ JOBS = {
     "normals": "neighbours, normals and their orientation",
     "curvature": "curvature at points: error and time on tori, MeshLab's filters",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
+    "surfels": "surfel hierarchies: normal maps against float64, builds, normals by map size, frames beside SLIM",
     "fuzz": "damaged files of every format: crashes, hangs, memory",
     "devices": "one answer everywhere: hashes of all devices' answers and how far they are apart",
     "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",

@@ -7,11 +7,13 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
-from .common import DeviceOption, QuietOption, Steps, checked_out
+from .common import DeviceOption, QuietOption, Steps, checked_out, is_surface
 from .recipe import (
     DegreeOption,
     ErrorOption,
+    HybridOption,
     KindOption,
+    MapSizeOption,
     MethodOption,
     NodesOption,
     PatchesOption,
@@ -32,7 +34,7 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
     """Say what a file holds: counts, bytes, bounds; with a scan beside it, the surface's error."""
     import clsurf
     thing = clsurf.load(path)
-    surface = isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface)
+    surface = is_surface(thing)
     if against is not None and not surface and not len(getattr(thing, "faces", ())):
         raise InputError(f"{path}: expected a surface or a mesh to measure against {against}, got points only")
     if study is not None and surface:
@@ -44,6 +46,8 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
         _about_slim(thing)
     elif isinstance(thing, clsurf.PatchSurface):
         _about_patches(thing)
+    elif isinstance(thing, clsurf.SurfelHierarchy):
+        _about_surfels(thing)
     elif hasattr(thing, "images"):
         for i, image in enumerate(thing.images):
             print(f"image {i:<3}{image}")
@@ -97,6 +101,22 @@ def _about_patches(surface) -> None:
     print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")
 
 
+def _about_surfels(surface) -> None:
+    import numpy as np
+    inner, levels = len(surface) - len(surface.base), np.bincount(surface.level)[1:]
+    finest = f"{len(surface.triangles):,} triangles of {len(surface.vertices):,} vertices" if surface.hybrid else \
+        f"{len(surface.base):,} base surfels"
+    print(f"finest   {finest}, spacing {surface.spacing:.4g}")
+    levels = levels if surface.hybrid else levels[:-1]
+    print(f"inner    {inner:,} surfels; by level " + ", ".join(f"{n:,}" for n in levels))
+    sizes, counts = np.unique(surface.map_size[:inner], return_counts=True)
+    covered = np.mean(surface.normal_atlas[:, 3] > 0) if len(surface.normal_atlas) else 1.0
+    print("maps     " + ", ".join(f"{n:,} of {s} x {s}" for s, n in zip(sizes, counts, strict=True)) +
+          f"; {covered:.1%} of {len(surface.normal_atlas):,} texels covered, colors "
+          f"{'no' if surface.color_atlas is None else 'yes'}")
+    print(f"error    bound {_bound(surface)}")
+
+
 def _bound(surface) -> str:
     return "not stored" if math.isnan(surface.bound) else \
         f"{surface.bound:g} for {surface.bound_share:.1%} of the scan's points"
@@ -107,17 +127,18 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
           out: Annotated[Path, typer.Argument(help="The surface to write: .clsurf, or for slim .slim2t.")],
           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
           spacing: SpacingOption = None, nodes: NodesOption = "", method: MethodOption = "", views: ViewsOption = None,
-          precise: PreciseOption = False, device: DeviceOption = "", quiet: QuietOption = False):
-    """Turn a scan into a surface: SLIM surfels or spatial patches."""
+          precise: PreciseOption = False, map_size: MapSizeOption = None, hybrid: HybridOption = False,
+          device: DeviceOption = "", quiet: QuietOption = False):
+    """Turn a scan into a surface: SLIM surfels, spatial patches, or a hierarchy of surfels with normal maps."""
     import clsurf
     steps = Steps(quiet)
-    how = recipe(kind, degree, error, patches=patches, spacing=spacing, nodes=nodes, method=method, views=views,
-                 precise=precise)
-    checked_out(out, (".clsurf",) if how.kind == "patches" else (".clsurf", ".slim2t"))
+    how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing, nodes=nodes, method=method,
+                 views=views, precise=precise)
+    checked_out(out, (".clsurf",) if how.kind in ("patches", "surfels") else (".clsurf", ".slim2t"))
     with steps.step("load"):
         loaded = clsurf.load(scan)
     steps.say(f"  {loaded}")
-    if isinstance(loaded, clsurf.SlimSurface | clsurf.PatchSurface):
+    if is_surface(loaded):
         raise InputError(f"{scan}: expected a scan, got a surface ({type(loaded).__name__})")
     if how.kind_for(loaded) == "patches":
         checked_out(out, (".clsurf",))
@@ -134,7 +155,7 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
 def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")],
             out: Annotated[Path, typer.Argument(help="The file to write; its ending chooses the format. Patches "
                                                 "become their nodes, joined by two triangles a cell where the format "
-                                                "has faces.")],
+                                                "has faces; surfel hierarchies their base surfels, or mesh.")],
             quiet: QuietOption = False):
     """Write a scan or a surface in another format."""
     import clsurf
@@ -142,13 +163,14 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
     from ..io.dispatch import WRITES
     from ..io.scans import WRITES as SCANS
     from ..surface.patch_mesh import patch_mesh
+    from ..surface.surfel import finest_scan
     steps = Steps(quiet)
     checked_out(out, WRITES)
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if isinstance(thing, clsurf.PatchSurface) and out.suffix.lower() in SCANS:
-        thing = patch_mesh(thing)
+    if isinstance(thing, clsurf.PatchSurface | clsurf.SurfelHierarchy) and out.suffix.lower() in SCANS:
+        thing = patch_mesh(thing) if isinstance(thing, clsurf.PatchSurface) else finest_scan(thing)
         steps.say(f"  {thing}")
     with steps.step("save"):
         clsurf.save(thing, out)

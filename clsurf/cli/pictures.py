@@ -9,7 +9,17 @@ import typer
 from ..errors import InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
 from .color_maps import ChannelOption, LegendOption, LimitOption, channel_picture
-from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
+from .common import (
+    PICTURES,
+    DeviceOption,
+    ProfileOption,
+    QuietOption,
+    SizeOption,
+    Steps,
+    checked_out,
+    is_surface,
+    parsed_size,
+)
 from .lights import LightOption, MaterialOption, MirrorOption, OcclusionOption, ShadowsOption, SkyOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .motion import (
@@ -22,11 +32,26 @@ from .motion import (
     motion,
 )
 from .output import AntialiasOption, BackgroundOption, BitsOption, ExposureOption, ToneOption, output
-from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
+from .recipe import (
+    DegreeOption,
+    ErrorOption,
+    HybridOption,
+    KindOption,
+    MapSizeOption,
+    PatchesOption,
+    Recipe,
+    SpacingOption,
+    parsed_error,
+    recipe,
+)
 
 SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
 LodOption = Annotated[float, typer.Option(help="slim: projected diameter in pixels below which coarser surfels serve; "
-                                          "8 is the fast mode, 0 draws leaves only.")]
+                                          "8 is the fast mode, 0 draws leaves only; surfels: the same near "
+                                          "silhouettes.")]
+InteriorOption = Annotated[float, typer.Option(help="surfels: projected diameter in pixels that they may have away "
+                                               "from silhouettes.")]
+NoMapsOption = Annotated[bool, typer.Option("--no-maps", help="surfels: one normal each, without normal maps.")]
 NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, exact, trilinear or homogeneous.")]
 CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
 AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, up to half "
@@ -87,10 +112,11 @@ def render(source: SourceArgument,
            bits: BitsOption = 8,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
+           interior: InteriorOption = 16.0, no_maps: NoMapsOption = False,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
-           spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
-           quiet: QuietOption = False):
+           spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
+           profile: ProfileOption = False, device: DeviceOption = "", quiet: QuietOption = False):
     """Draw a surface or a scan into a picture, or into a moving one."""
     import clsurf
 
@@ -108,7 +134,8 @@ def render(source: SourceArgument,
         raise InputError(f"channels: expected color among them for a {out.suffix} picture, got {channels}: add it, or "
                          "write .exr")
     view = checked_view(direction, up, fov, eye, target, ortho)
-    how = recipe(kind, degree, error, patches=patches, spacing=spacing)
+    how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
+    surfels = clsurf.SurfelDrawing(interior, not no_maps)
     lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel)
@@ -128,7 +155,7 @@ def render(source: SourceArgument,
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
                               written.background, chosen, supersampling=supersampling, patches=drawing,
-                              antialias=written.antialias)
+                              surfels=surfels, antialias=written.antialias)
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
@@ -157,7 +184,8 @@ def report(source: SourceArgument,
            fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
-           spacing: SpacingOption = None, device: DeviceOption = "", quiet: QuietOption = False):
+           spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
+           device: DeviceOption = "", quiet: QuietOption = False):
     """Write one HTML page about a surface and a view of it: counts, operations, times, the picture."""
     import clsurf
 
@@ -165,7 +193,7 @@ def report(source: SourceArgument,
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     checked_out(out, (".html", ".htm"))
     view = checked_view(direction, up, fov, eye, target, ortho)
-    how = recipe(kind, degree, error, patches=patches, spacing=spacing)
+    how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     chosen = clsurf.open_device(device or None)
     thing = loaded_surface(source, how, chosen, steps)
@@ -181,7 +209,7 @@ def loaded_surface(source: Path, how: Recipe, device, steps: Steps):
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
+    if not is_surface(thing):
         with steps.step("build"):
             thing = how.build(thing, device, steps)
         steps.say(f"  {thing}")

@@ -8,30 +8,35 @@ import typer
 from ..errors import InputError
 from .common import Steps
 
-KINDS = ("slim", "patches")
+KINDS = ("slim", "patches", "surfels")
 
-KindOption = Annotated[str, typer.Option(help="slim or patches; default: patches for range images or where an option "
-                                         "of patches is given, otherwise slim.")]
+KindOption = Annotated[str, typer.Option(help="slim, patches or surfels; default: patches for range images or where an "
+                                         "option of patches is given, surfels where one of theirs is, otherwise "
+                                         "slim.")]
 ErrorOption = Annotated[str, typer.Option(help="slim: T_MDL relative to the bounding box's diagonal [0.01], or 'auto': "
                                           "from the scan's noise. patches: root mean square distance relative to the "
                                           "diagonal.")]
 DegreeOption = Annotated[int | None, typer.Option(min=1, max=3, help="slim: degree of the surfels, 1, 2 or 3 [2].")]
 PatchesOption = Annotated[int | None, typer.Option(help="patches: how many.")]
-SpacingOption = Annotated[float | None, typer.Option(help="patches: distance between nodes, world units.")]
+SpacingOption = Annotated[float | None, typer.Option(help="patches: distance between nodes; surfels: between base "
+                                                     "surfels; world units.")]
 NodesOption = Annotated[str, typer.Option(help="patches: nodes of one, such as 17 or 17x9 [17].")]
 MethodOption = Annotated[str, typer.Option(help="patches: areas (meshes), local or global_views (clouds), ranges "
                                            "(range images); by default what fits the scan.")]
 ViewsOption = Annotated[int | None, typer.Option(help="patches: number of views of global_views.")]
 PreciseOption = Annotated[bool, typer.Option(help="patches: 32-bit displacements and RGBA, 8 bytes a node.")]
+MapSizeOption = Annotated[int | None, typer.Option(help="surfels: texels along a side of a normal map, 1 to 64 [16].")]
+HybridOption = Annotated[bool, typer.Option("--hybrid", help="surfels: the mesh's triangles are the finest level.")]
 
 
 @dataclass(frozen=True)
 class Recipe:
     """A kind of surface and the options it is built with, checked."""
 
-    kind: str  # "slim", "patches", or "": by the scan
+    kind: str  # "slim", "patches", "surfels", or "": by the scan
     slim: dict = field(default_factory=dict)
     patches: dict = field(default_factory=dict)
+    surfels: dict = field(default_factory=dict)
 
     def kind_for(self, scan) -> str:
         """Return the kind of surface that `scan` becomes."""
@@ -42,10 +47,13 @@ class Recipe:
         import clsurf
         if self.kind_for(scan) == "patches":
             return clsurf.build_patches(scan, **self.patches, device=device, progress=steps.progress)
+        if self.kind == "surfels":
+            return clsurf.build_surfels(scan, **self.surfels, device=device, progress=steps.progress)
         return clsurf.build_slim(scan, **self.slim, device=device, progress=steps.progress)
 
 
-def recipe(kind: str = "", degree: int | None = None, error: str = "", **patch_options) -> Recipe:
+def recipe(kind: str = "", degree: int | None = None, error: str = "", map_size: int | None = None,
+           hybrid: bool = False, **patch_options) -> Recipe:
     """Return the recipe that a command's options ask for, or raise InputError.
 
     Parameters
@@ -56,7 +64,14 @@ def recipe(kind: str = "", degree: int | None = None, error: str = "", **patch_o
     from ..build.patches import METHODS, checked_request
     given = {name: value for name, value in patch_options.items() if value not in ("", None) and value is not False}
     if kind not in ("", *KINDS):
-        raise InputError(f"kind: expected slim or patches, got {kind!r}")
+        raise InputError(f"kind: expected {', '.join(KINDS[:-1])} or {KINDS[-1]}, got {kind!r}")
+    of_surfels = {"map_size": map_size} if map_size is not None else {}
+    of_surfels |= {"hybrid": True} if hybrid else {}
+    if kind == "surfels" or (of_surfels and not kind):
+        return surfel_recipe(degree, error, of_surfels, given)
+    if of_surfels:
+        name = next(iter(of_surfels)).replace("_", "-")
+        raise InputError(f"--{name}: an option of --kind surfels, got --kind {kind}")
     if kind == "slim" and given:
         raise InputError(f"--{next(iter(given))}: an option of --kind patches, got --kind slim")
     if degree is not None and (given or kind == "patches"):
@@ -72,6 +87,18 @@ def recipe(kind: str = "", degree: int | None = None, error: str = "", **patch_o
                     given.get("precise", False))
     slim = {"degree": degree or 2, "error": parsed_error(error, "slim") if kind != "patches" and error else 0.01}
     return Recipe(kind, slim, given)
+
+
+def surfel_recipe(degree, error, of_surfels: dict, others: dict) -> Recipe:
+    """Return the recipe of a surfel hierarchy, or raise InputError where options of other kinds are given."""
+    from ..build.surfels import checked_options
+    spacing = others.pop("spacing", None)
+    wrong = "degree" if degree is not None else "error" if error else next(iter(others), None)
+    if wrong:
+        raise InputError(f"--{wrong}: an option of --kind {'slim' if wrong in ('degree', 'error') else 'patches'}, got "
+                         "--kind surfels")
+    checked_options(spacing, of_surfels.get("map_size", 16), of_surfels.get("hybrid", False))
+    return Recipe("surfels", surfels=of_surfels | ({} if spacing is None else {"spacing": spacing}))
 
 
 def parsed_error(text: str, kind: str = "slim") -> float | str:

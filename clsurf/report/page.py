@@ -22,12 +22,15 @@ from ..render.tiles import BIN
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .charts import bars
 from .sections import Section, View, patch_sections, slim_sections, table
 from .style import PAGE
+from .surfels import surfel_sections
 
 # What a report says of a surface, by its kind: a function from (surface or placed surface, view, number) to sections.
-SECTIONS: dict[type, Callable[..., list[Section]]] = {PatchSurface: patch_sections, SlimSurface: slim_sections}
+SECTIONS: dict[type, Callable[..., list[Section]]] = {PatchSurface: patch_sections, SlimSurface: slim_sections,
+                                                       SurfelHierarchy: surfel_sections}
 CHANNELS = ("color", "depth", "id", "count", "level", "cost")
 FRAMES = 9  # drawn for the times, after one that compiles the kernels and uploads the surfaces
 

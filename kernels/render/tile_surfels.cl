@@ -36,7 +36,7 @@
 // The pairs of one block, a segment of the bin's list at a time: what remains has no unpredictable branch.
 #define PAIRS const uint2 *
 #define SKIP(pair, bits)
-#define SEGMENT 256
+#define SEGMENT 64
 INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *kept) {
   int n = 0;
   for (int e = 0; e < count; e++) {
