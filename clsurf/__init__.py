@@ -13,6 +13,7 @@ from .analysis.line_surface import line_surface
 from .analysis.lines import line_channels, lines
 from .analysis.smooth import smooth
 from .analysis.sparsity import slim_of_error, sparsity
+from .build.morph import morph
 from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
@@ -42,10 +43,53 @@ from .trace.hits import Hits, trace
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "ScaleMap",
-    "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches",
-    "build_scale_map", "build_slim", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels",
-    "line_surface", "lines", "load", "load_frames", "models", "open_device", "project", "render", "report", "save",
-    "slim_of_error", "smooth", "sparsity", "trace",
+    "Camera",
+    "Curvature",
+    "Device",
+    "Error",
+    "Frame",
+    "Hits",
+    "Light",
+    "Lines",
+    "Mesh",
+    "PatchDrawing",
+    "PatchSurface",
+    "Placed",
+    "PointCloud",
+    "Profile",
+    "Projection",
+    "RangeImage",
+    "RangeScan",
+    "Renderer",
+    "ScaleMap",
+    "ScaleMapDrawing",
+    "Scene",
+    "Shading",
+    "SlimDrawing",
+    "SlimSurface",
+    "SurfaceError",
+    "build_patches",
+    "build_scale_map",
+    "build_slim",
+    "color_map",
+    "curvature",
+    "error",
+    "errors",
+    "estimate_normals",
+    "line_channels",
+    "line_surface",
+    "lines",
+    "load",
+    "load_frames",
+    "models",
+    "morph",
+    "open_device",
+    "project",
+    "render",
+    "report",
+    "save",
+    "slim_of_error",
+    "smooth",
+    "sparsity",
+    "trace",
 ]

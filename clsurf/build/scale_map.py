@@ -82,7 +82,7 @@ def build_scale_map(thing, size: int = 128, center=None, radius: float | None = 
     """
     if isinstance(thing, str | os.PathLike):
         thing = load(thing)
-    _check(size, bits, layers, hit, radius)
+    check_options(size, bits, layers, hit, radius)
     device, report = open_device(device), _Reporter(progress)
     report(0.0)
     source = _source(thing, device)
@@ -136,7 +136,8 @@ def radial_bound(surface: ScaleMap, points: NDArray | None) -> float:
     return found if np.isfinite(found) else float("nan")
 
 
-def _check(size, bits, layers, hit, radius) -> None:
+def check_options(size=128, bits=8, layers=1, hit="outermost", radius=None) -> None:
+    """Raise InputError unless the options can be used."""
     for name, value, most in (("size", size, LARGEST_SIZE), ("layers", layers, LARGEST_LAYERS)):
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or not 1 <= value <= most:
             raise InputError(f"{name}: expected a whole number from 1 to {most}, got {value!r}")

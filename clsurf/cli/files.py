@@ -9,16 +9,23 @@ import typer
 from ..errors import InputError
 from .common import DeviceOption, QuietOption, Steps, checked_out
 from .recipe import (
+    BitsOption,
+    CenterOption,
     DegreeOption,
     ErrorOption,
+    HitOption,
     KindOption,
+    LayersOption,
     MethodOption,
     NodesOption,
+    NormalsOption,
     PatchesOption,
     PreciseOption,
     SpacingOption,
+    TexelsOption,
     ViewsOption,
     recipe,
+    with_scale_map,
 )
 
 
@@ -32,7 +39,7 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
     """Say what a file holds: counts, bytes, bounds; with a scan beside it, the surface's error."""
     import clsurf
     thing = clsurf.load(path)
-    surface = isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface)
+    surface = isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.ScaleMap)
     if against is not None and not surface and not len(getattr(thing, "faces", ())):
         raise InputError(f"{path}: expected a surface or a mesh to measure against {against}, got points only")
     if study is not None and surface:
@@ -44,6 +51,8 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
         _about_slim(thing)
     elif isinstance(thing, clsurf.PatchSurface):
         _about_patches(thing)
+    elif isinstance(thing, clsurf.ScaleMap):
+        _about_scale_map(thing)
     elif hasattr(thing, "images"):
         for i, image in enumerate(thing.images):
             print(f"image {i:<3}{image}")
@@ -97,6 +106,17 @@ def _about_patches(surface) -> None:
     print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")
 
 
+def _about_scale_map(surface) -> None:
+    center = ", ".join(f"{v:.10g}" for v in surface.center)
+    print(f"texels   6 x {surface.size} x {surface.size}, {surface.bits} bits, layers {surface.layers}, {surface.hit} "
+          f"hits, normals {'no' if surface.normals is None else 'yes'}")
+    print(f"sphere   center [{center}], radius {surface.radius:.8g}")
+    print(f"rays     {surface.hole_share:.2%} of layer 0 without a hit; " +
+          ("with several hits: not known" if math.isnan(surface.multiple_share) else
+           f"{surface.multiple_share:.2%} of the sphere with several hits"))
+    print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")
+
+
 def _bound(surface) -> str:
     return "not stored" if math.isnan(surface.bound) else \
         f"{surface.bound:g} for {surface.bound_share:.1%} of the scan's points"
@@ -107,17 +127,20 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
           out: Annotated[Path, typer.Argument(help="The surface to write: .clsurf, or for slim .slim2t.")],
           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
           spacing: SpacingOption = None, nodes: NodesOption = "", method: MethodOption = "", views: ViewsOption = None,
-          precise: PreciseOption = False, device: DeviceOption = "", quiet: QuietOption = False):
-    """Turn a scan into a surface: SLIM surfels or spatial patches."""
+          precise: PreciseOption = False, size: TexelsOption = None, bits: BitsOption = None,
+          layers: LayersOption = None, normals: NormalsOption = False, hit: HitOption = "", center: CenterOption = "",
+          device: DeviceOption = "", quiet: QuietOption = False):
+    """Turn a scan into a surface: SLIM surfels, spatial patches or a spherical scale map."""
     import clsurf
     steps = Steps(quiet)
     how = recipe(kind, degree, error, patches=patches, spacing=spacing, nodes=nodes, method=method, views=views,
                  precise=precise)
-    checked_out(out, (".clsurf",) if how.kind == "patches" else (".clsurf", ".slim2t"))
+    how = with_scale_map(how, size, bits, layers, normals, hit, center)
+    checked_out(out, (".clsurf",) if how.kind in ("patches", "scale_map") else (".clsurf", ".slim2t"))
     with steps.step("load"):
         loaded = clsurf.load(scan)
     steps.say(f"  {loaded}")
-    if isinstance(loaded, clsurf.SlimSurface | clsurf.PatchSurface):
+    if isinstance(loaded, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.ScaleMap) and how.kind != "scale_map":
         raise InputError(f"{scan}: expected a scan, got a surface ({type(loaded).__name__})")
     if how.kind_for(loaded) == "patches":
         checked_out(out, (".clsurf",))
@@ -133,8 +156,8 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
 
 def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")],
             out: Annotated[Path, typer.Argument(help="The file to write; its ending chooses the format. Patches "
-                                                "become their nodes, joined by two triangles a cell where the format "
-                                                "has faces.")],
+                                                "become their nodes and scale maps their texels, joined by two "
+                                                "triangles a cell where the format has faces.")],
             quiet: QuietOption = False):
     """Write a scan or a surface in another format."""
     import clsurf
@@ -142,6 +165,7 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
     from ..io.dispatch import WRITES
     from ..io.scans import WRITES as SCANS
     from ..surface.patch_mesh import patch_mesh
+    from ..surface.scale_mesh import scale_mesh
     steps = Steps(quiet)
     checked_out(out, WRITES)
     with steps.step("load"):
@@ -149,6 +173,9 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
     steps.say(f"  {thing}")
     if isinstance(thing, clsurf.PatchSurface) and out.suffix.lower() in SCANS:
         thing = patch_mesh(thing)
+        steps.say(f"  {thing}")
+    if isinstance(thing, clsurf.ScaleMap) and out.suffix.lower() in SCANS:
+        thing = scale_mesh(thing)
         steps.say(f"  {thing}")
     with steps.step("save"):
         clsurf.save(thing, out)

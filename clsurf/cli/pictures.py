@@ -21,6 +21,10 @@ NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, ex
 CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
 AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, up to half "
                                            "their alpha.")]
+FormOption = Annotated[str, typer.Option(help="scale_map: cast (rays of pixels) or geosphere.")]
+FacesOption = Annotated[int, typer.Option(help="scale_map: subdivisions of the geosphere, 0 to 9; 6: 81,920 "
+                                          "triangles.")]
+MapNormalsOption = Annotated[str, typer.Option(help="scale_map: auto, stored, neighbours or gradient.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
 LookOption = Annotated[str, typer.Option(help="phong, flat, reflection (lines); slim: ball_size, ball_level.")]
 
@@ -70,6 +74,7 @@ def render(source: SourceArgument,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
+           form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
            quiet: QuietOption = False):
@@ -91,6 +96,7 @@ def render(source: SourceArgument,
     how = recipe(kind, degree, error, patches=patches, spacing=spacing)
     lit = lighting(shading, light, shadows, occlusion, mirror)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
     checked_supersampling(supersampling)
     if colored:
         colored.prepared(how, degree)
@@ -107,7 +113,7 @@ def render(source: SourceArgument,
             frame = colored.draw(thing, camera, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         else:
             frame = clsurf.render(lit.scene(thing, camera), camera, picture_size, wanted, lit.shading, lod,
-                                  device=chosen, supersampling=supersampling, patches=drawing)
+                                  device=chosen, supersampling=supersampling, patches=drawing, scale_map=scale_map)
     if profile:
         print(chosen.profile)
         chosen.profile = None
@@ -149,7 +155,7 @@ def loaded_surface(source: Path, how: Recipe, device, steps: Steps):
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
+    if not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.ScaleMap):
         with steps.step("build"):
             thing = how.build(thing, device, steps)
         steps.say(f"  {thing}")
