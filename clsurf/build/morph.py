@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..device import open_device
 from ..errors import InputError
-from ..surface.cube import interpolated, texel_directions
+from ..surface.cube import bordered, interpolated, texel_directions
 from ..surface.placed import Placed
 from ..surface.scale_map import ScaleMap, encoded, encoded_normals
 from .scale_map import build_scale_map
@@ -41,7 +41,7 @@ def morph(a, b=None, t: float | None = None, bits: int | None = None, device=Non
     -------
     ScaleMap
         With the largest size among the models. A direction is a hole where models with more than half of the weight
-        have one. Where all models have normals the result has those of the blended shape: with the normals n of the
+        have one; in its holes a model goes on as at their rims. Where all models have normals the result has those of the blended shape: with the normals n of the
         models of distance r in direction d, n r / (n.d) adds up by weight.
 
     Raises
@@ -80,8 +80,7 @@ def blend(parts: list[dict], weights: NDArray, bits: int | None = None) -> Scale
     weights = np.asarray(weights, np.float64)
     known = sum(w * p["valid"] for w, p in zip(weights, parts, strict=True))
     valid = known >= 0.5 - 1e-9
-    total = sum(w * np.where(p["valid"], p["distance"], 0) for w, p in zip(weights, parts, strict=True))
-    distance = total / np.maximum(known, 1e-12)
+    distance = sum(w * p["distance"] for w, p in zip(weights, parts, strict=True))
     radius = float(weights @ [p["radius"] for p in parts])
     normals = None
     if all(p["normals"] is not None for p in parts):
@@ -89,12 +88,9 @@ def blend(parts: list[dict], weights: NDArray, bits: int | None = None) -> Scale
         normals = 0.0
         for w, p in zip(weights, parts, strict=True):
             along = np.maximum((p["normals"] * d).sum(axis=-1, keepdims=True), STEEPEST)
-            normals = normals + np.where(p["valid"][..., None], w * p["distance"][..., None] * p["normals"] / along, 0)
+            normals = normals + w * p["distance"][..., None] * p["normals"] / along
         normals = encoded_normals(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12))
-    lambdas = np.where(valid, distance / radius, 0)
-    largest = float(lambdas.max())
-    if largest > 1:  # where models with holes are left out, the others may reach further
-        radius, lambdas = radius * largest, lambdas / largest
+    lambdas = np.where(valid, np.minimum(distance / radius, 1), 0)
     used = [p for w, p in zip(weights, parts, strict=True) if w > 0]
     bits = max(p["bits"] for p in used) if bits is None else bits
     return ScaleMap(sum(w * p["center"] for w, p in zip(weights, parts, strict=True)), radius,
@@ -144,7 +140,28 @@ def _resampled(surface: ScaleMap, scale: float, center: NDArray, size: int) -> d
             normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
         values, known = interpolated(values, valid, d)
         values, valid = values.reshape(6, size, size), known.reshape(6, size, size)
+    if not valid.all() and valid.any():
+        values = _without_holes(values, valid)
+        if normals is not None:
+            normals = _without_holes(normals, valid)
+            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     share = surface.multiple_share
     return {"center": center, "radius": scale * surface.radius, "distance": scale * surface.radius * values,
             "valid": valid, "normals": normals, "bits": surface.bits, "hit": surface.hit,
             "share": 0.0 if np.isnan(share) else share, "diagonal": scale * surface.diagonal}
+
+
+def _without_holes(values: NDArray, valid: NDArray) -> NDArray:
+    """Return values (6, s, s, ...) that go on from the rims of the holes inward, the mean of the texels around each."""
+    values, known, size = np.array(values), valid.copy(), valid.shape[-1]
+    while not known.all():
+        around, ok = bordered(values, known, size)
+        total, count = np.zeros_like(values), np.zeros((*known.shape, *[1] * (values.ndim - 3)), int)
+        for i, j in ((0, 1), (2, 1), (1, 0), (1, 2)):
+            part = np.s_[:, i:i + size, j:j + size]
+            use = ok[part].reshape(*ok[part].shape, *[1] * (values.ndim - 3))
+            total, count = total + np.where(use, around[part], 0), count + use
+        rim = ~known & (count.reshape(known.shape) > 0)
+        values[rim] = (total / np.maximum(count, 1))[rim]
+        known |= rim
+    return values
