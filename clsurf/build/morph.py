@@ -41,8 +41,8 @@ def morph(a, b=None, t: float | None = None, bits: int | None = None, device=Non
     -------
     ScaleMap
         With the largest size among the models. A direction is a hole where models with more than half of the weight
-        have one; in its holes a model goes on as at their rims. Where all models have normals the result has those of the blended shape: with the normals n of the
-        models of distance r in direction d, n r / (n.d) adds up by weight.
+        have one; in its holes a model goes on as at their rims. Where all models have normals the result has those of
+        the blended shape: with the normals n of the models of distance r in direction d, n r / (n.d) adds up by weight.
 
     Raises
     ------
