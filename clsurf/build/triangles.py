@@ -1,4 +1,4 @@
-"""Distances from points to triangle meshes."""
+"""Nearest triangles of meshes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ def triangle_distances(vertices: NDArray, faces: NDArray, points: NDArray, devic
 
 
 def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device: Device) -> tuple[NDArray, NDArray]:
-    """Return the distances (n,) float64 of points to the nearest triangle, and which face that is, (n,) int64.
+    """Return the distances (n,) float64 of points to the nearest triangle, and its number (n,) int64.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
         No face with finite corners.
     """
     corners = np.asarray(vertices, np.float64)[faces]
-    number = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
-    corners = corners[number]
+    kept = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
+    corners = corners[kept]
     if not len(corners):
         raise InputError("surface: expected a mesh with faces, got none with finite corners")
     box = column_bounds(corners.reshape(-1, 3))
@@ -42,7 +42,7 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
     corners = (corners - middle) / unit
     centroid = corners.mean(axis=1)
     order, _, _ = morton_order(np.ascontiguousarray(centroid, np.float32), device)
-    corners, centroid, number = corners[order], centroid[order], number[order]
+    corners, centroid, kept = corners[order], centroid[order], kept[order]
     padded = -(-len(order) // BLOCK) * BLOCK
     records = np.zeros((padded, TRIANGLE), np.float32)
     records[:len(order), :3] = corners[:, 0]
@@ -56,15 +56,15 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
             *build_boxes(on_device, padded, device, radius=device.upload(balls[3])))
     kernel = device.kernel("build/triangle_distances.cl")
     margin = float(np.median(radius))
-    out, which = np.empty(len(points)), np.empty(len(points), np.int64)
+    out, number = np.empty(len(points)), np.empty(len(points), np.int64)
     for start in range(0, len(points), BATCH):
         local = np.ascontiguousarray((np.asarray(points[start:start + BATCH], np.float64) - middle) / unit, np.float32)
         order, _, _ = morton_order(local, device)
         stride = -(-len(local) // BLOCK) * BLOCK
         queries = np.zeros((3, stride), np.float32)
         queries[:, :len(local)] = local[order].T
-        found, nearest = device.empty(stride, np.float32), device.empty(stride, np.int32)
-        kernel((stride // BLOCK,), (1,), len(local), stride, device.upload(queries), *tree, margin, found, nearest)
+        found, at = device.empty(stride, np.float32), device.empty(stride, np.int32)
+        kernel((stride // BLOCK,), (1,), len(local), stride, device.upload(queries), *tree, margin, found, at)
         out[start + order] = device.download(found, copy=False)[:len(local)]
-        which[start + order] = number[device.download(nearest, copy=False)[:len(local)]]
-    return out * unit, which
+        number[start + order] = kept[device.download(at, copy=False)[:len(local)]]
+    return out * unit, number

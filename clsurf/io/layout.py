@@ -18,9 +18,10 @@ from clsurf.surface.patch import PatchSurface
 from clsurf.surface.ranges import RangeImage, RangeScan
 from clsurf.surface.scale_map import ScaleMap
 from clsurf.surface.slim import SlimSurface
+from clsurf.surface.surfel import SurfelHierarchy
 
-KINDS = {"slim": SlimSurface, "patches": PatchSurface, "mesh": Mesh, "points": PointCloud, "ranges": RangeScan,
-         "scale_map": ScaleMap}
+KINDS = {"slim": SlimSurface, "patches": PatchSurface, "surfels": SurfelHierarchy, "scale_map": ScaleMap, "mesh": Mesh,
+         "points": PointCloud, "ranges": RangeScan}
 
 
 def to_arrays(thing) -> tuple[str, dict[str, NDArray], dict[str, Any]]:

@@ -62,9 +62,7 @@ def write_video(path, frames, fps: float = 30.0, quality: int = 90, loop: int = 
     """
     path = known_video(path)
     ending = path.suffix.lower()
-    most = MOST_FPS.get(ending, 240.0)
-    if not isinstance(fps, int | float | np.number) or not 0 < fps <= most:
-        raise InputError(f"fps: expected frames a second from above 0 to {most:g}, got {fps!r}")
+    checked_fps(path, fps)
     if not isinstance(quality, int | np.integer) or not 1 <= quality <= 100:
         raise InputError(f"quality: expected 1 to 100, got {quality!r}")
     if not isinstance(loop, int | np.integer) or not 0 <= loop < 65536:
@@ -98,6 +96,13 @@ def known_video(path) -> Path:
     if ending == ".mp4":
         _ffmpeg(path)
     return writable_place(path)
+
+
+def checked_fps(path: Path, fps: float) -> None:
+    """Raise InputError unless a video at `path` can be played that fast."""
+    most = MOST_FPS.get(path.suffix.lower(), 240.0)
+    if not isinstance(fps, int | float | np.number) or not 0 < fps <= most:
+        raise InputError(f"fps: expected frames a second from above 0 to {most:g}, got {fps!r}")
 
 
 def _checked_pictures(frames, largest: int, ending: str) -> Iterator[NDArray]:

@@ -1,5 +1,6 @@
 """The renderer: a list of stages from a scene to a frame."""
 
+import os
 import threading
 import weakref
 
@@ -7,13 +8,17 @@ import numpy as np
 
 from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
+from .clip import checked_clip, view_clip
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
+from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
 from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
@@ -25,15 +30,18 @@ from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
+from .surfels import draw_surfels, upload_surfels
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
-         ScaleMap: (upload_scale_map, draw_scale_map)}
+         SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
+         Mesh: (upload_mesh, draw_mesh)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM = Shading(), PatchDrawing(), SlimDrawing()
-DEFAULT_SCALE_MAP = ScaleMapDrawing()
+DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP = (
+    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing())
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -74,7 +82,8 @@ class Renderer:
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None, scale_map: ScaleMapDrawing | None = None) -> Frame:
+               slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+               scale_map: ScaleMapDrawing | None = None, clip=None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -109,8 +118,13 @@ class Renderer:
             How spatial patches are drawn.
         slim : SlimDrawing, optional
             How SLIM surfaces are drawn.
+        surfels : SurfelDrawing, optional
+            How surfel hierarchies are drawn.
         scale_map : ScaleMapDrawing, optional
             How scale maps are drawn.
+        clip : (4,) or (n, 4) array_like, optional
+            Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
+            that the inside is seen. What is cut off still throws shadows and is seen in mirrors.
 
         Returns
         -------
@@ -125,8 +139,10 @@ class Renderer:
         """
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
+        if self.device.process != os.getpid():
+            raise DeviceError("renderer: it was made before this process was forked: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
-        factor = checked_supersampling(supersampling)
+        factor, clip = checked_supersampling(supersampling), checked_clip(clip)
         picture, size = size, checked_size([n * factor for n in size])
         asked, channels = channels, fine_channels(channels, factor)
         curved = wanted_differentials(channels)
@@ -142,6 +158,9 @@ class Renderer:
         slim = DEFAULT_SLIM if slim is None else slim
         if not isinstance(slim, SlimDrawing):
             raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
+        surfels = DEFAULT_SURFELS if surfels is None else surfels
+        if not isinstance(surfels, SurfelDrawing):
+            raise InputError(f"surfels: expected a clsurf.SurfelDrawing, got {surfels!r}")
         scale_map = DEFAULT_SCALE_MAP if scale_map is None else scale_map
         if not isinstance(scale_map, ScaleMapDrawing):
             raise InputError(f"scale_map: expected a clsurf.ScaleMapDrawing, got {scale_map!r}")
@@ -155,18 +174,20 @@ class Renderer:
             placed, origin = scene.placed, scene_origin(scene)
             traced = wants_traced_light(shading, channels)
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not traced
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, planes=not at_once)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, view_clip(clip, camera),
+                                  planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             if at_once:
-                (surface, matrix), look = placed[0], Look(shading, lod, patches, slim, scale_map)
+                (surface, matrix), look = placed[0], Look(shading, lod, patches, slim)
                 arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
                                        whole, floats, channels)
             else:
                 lamps = self.device.upload(floats)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, slim, scale_map, lamps, "cost" in channels),
+                                            Look(shading, lod, patches, slim, surfels, scale_map, lamps,
+                                                 "cost" in channels),
                                             number)
                 if traced:
                     light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
@@ -186,7 +207,7 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, planes: bool) -> Grid:
+    def _new_grid(self, placed, size, channels, curved, shading, patches, clip, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
         colored = shading.model_colors and any(getattr(s, name, None) is not None
                                                for s, _ in placed for name in ("colors", "color"))
@@ -197,7 +218,7 @@ class Renderer:
         traced = wants_traced_light(shading, channels)
         layout = Layout(color=(colored or lit or traced) and "color" in channels, id="id" in channels,
                         count="count" in channels, level="level" in channels, lit=lit, traced=traced,
-                        differentials=curved)
+                        clip_planes=len(clip), differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,
@@ -205,11 +226,11 @@ class Renderer:
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
         patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
         if not planes:
-            return Grid(size, self.tile_bins, layout, None, None, patch_bins)
+            return Grid(size, self.tile_bins, layout, None, None, patch_bins, clip)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
         return Grid(size, self.tile_bins, layout, touched,
-                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins)
+                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins, clip)
 
     def _uploaded(self, surface):
         upload = self._uploads.get(surface)
@@ -275,14 +296,14 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None,
-           scale_map: ScaleMapDrawing | None = None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+           scale_map: ScaleMapDrawing | None = None, clip=None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim, scale_map)
+                                                supersampling, patches, slim, surfels, scale_map, clip)
 
 
 _shared = threading.local()

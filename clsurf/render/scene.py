@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface, ScaleMap)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

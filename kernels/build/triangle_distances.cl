@@ -1,4 +1,4 @@
-// Distance from 16 queries at a time, one per lane, to the nearest of a mesh's triangles.
+// Distance from 16 queries at a time, one per lane, to the nearest of a mesh's triangles, and its number.
 //
 // Triangles stand behind their balls (centroid and furthest corner) in blocks of 16 under the tree of point_tree.clh.
 // The reach grows until the nearest triangle of every lane lies inside what was searched.
@@ -55,11 +55,11 @@ __kernel void triangle_distances(int count, int query_stride, __global const flo
   uint list[BLOCK_LIST];
   Traversal t;
   VF best = 1e30f;
-  VI which = 0;
+  VI found = 0;
   for (int round = 0; round < 200; ++round) {
     float reach = s.extent + margin;
     best = 1e30f;
-    which = 0;
+    found = 0;
     traversal_start(&t, top_level);
     int blocks;
     while ((blocks = traversal_next(&t, boxes, node_offset, s.x, s.y, s.z, reach * reach, list)) > 0)
@@ -69,7 +69,7 @@ __kernel void triangle_distances(int count, int query_stride, __global const flo
         for (int j = 0; j < 16; ++j) {
           if (!near.s[j]) continue;
           VF d2 = triangle_gap2(triangles + TRIANGLE * (16 * (size_t)list[b] + j), p);
-          which = SEL(which, (VI)(int)(16 * list[b] + j), d2 < best);
+          found = SEL(found, (VI)((int)(16 * list[b] + j)), d2 < best);
           best = SEL(best, d2, d2 < best);
         }
       }
@@ -78,5 +78,5 @@ __kernel void triangle_distances(int count, int query_stride, __global const flo
     margin = worst < 1e29f ? sqrt(worst) * 1.0001f + 1e-9f : 2.0f * margin;
   }
   ((__global VF *)out)[packet] = VSQRT(best);
-  ((__global VI *)nearest)[packet] = which;
+  ((__global VI *)nearest)[packet] = found;
 }
