@@ -160,6 +160,25 @@ def test_near_plane_opens_the_surface_and_shows_its_inside(renderers, drawing):
 
 
 @pytest.mark.parametrize("drawing", (CAST, SPHERE))
+@pytest.mark.parametrize("camera", cameras())
+def test_clip_planes_cut_the_surface(renderers, drawing, camera):
+    """What is left lies on the sphere and on the kept side; where the front is cut away the inside is seen."""
+    surface = twin.smooth_map(32)
+    ahead = camera.rotation[2]
+    for renderer in renderers:
+        for plane in ((*ahead, 0.2), (*-ahead, 0.2), (1, 0, 0, -0.1)):
+            frame = renderer.render(surface, camera, SIZE, ("depth", "normal", "position"), scale_map=drawing, clip=plane)
+            hit, points = points_of(frame)
+            assert hit.sum() > 300 and (points @ plane[:3] + plane[3]).min() > -1e-3
+            assert np.quantile(np.abs(np.linalg.norm(points, axis=1) - 1), 0.99) < 0.01
+            whole = np.isfinite(renderer.render(surface, camera, SIZE, "depth", scale_map=drawing).depth)
+            assert (hit <= whole).mean() > 0.999
+        cut = renderer.render(surface, camera, SIZE, "depth", scale_map=drawing, clip=(*-ahead, 0.2)).depth
+        middle = np.linalg.norm(camera.eye)
+        assert cut[36, 48] == pytest.approx(middle + 1, abs=0.01)
+
+
+@pytest.mark.parametrize("drawing", (CAST, SPHERE))
 def test_eye_inside_sees_the_surface_all_around(renderers, drawing):
     """The eye's plane cuts the map: triangles that cross it are drawn where they lie in front."""
     surface = twin.smooth_map(16)
