@@ -4,6 +4,7 @@ Source: Reiter, "Spherical Scale Mapping", 2005, sections 4 and 5: 2500 triangle
 320x240, 14 frames a second; steep slopes that a geosphere cannot follow.
 """
 
+import itertools
 import statistics
 import time
 
@@ -167,7 +168,7 @@ def geosphere_errors(surface, device, levels) -> dict:
                              "median": float(np.median(gap)), "p99": float(np.quantile(gap, 0.99)),
                              "max": float(gap.max())}
     rms = [one["rms"] for one in found.values()]
-    if not all(b < a for a, b in zip(rms, rms[1:], strict=False)):
+    if not all(finer < coarser for coarser, finer in itertools.pairwise(rms)):
         raise WrongAnswer(f"bench scale_map: expected finer geospheres to be nearer, got RMS {rms}")
     return found
 
@@ -202,14 +203,15 @@ def morphs(surface, device) -> dict:
 
 def show(figures: dict) -> None:
     """Print the figures beside floors and aims."""
-    print_table(("closed forms", "largest error of lambda, 16 bits", *(f"between texels, {s}" for s in SIZES), "orders"),
+    print_table(("closed forms", "largest error, 16 bits", *(f"between texels, {s}" for s in SIZES), "orders"),
                 [(name, f"{error:.2e}", *(f"{figures['order'][name]['errors'][str(s)]:.2e}" for s in SIZES),
                   ", ".join(f"{o:.2f}" for o in figures["order"][name]["orders"]))
                  for name, error in figures["exact"].items()])
     rays = figures["rays"]
-    print(f"{figures['scene']}: {rays['several_hits']:.2%} of the rays with several hits, {rays['without_hit']:.2%} of the "
-          "texels without one")
-    rows = [(f"build, {name}", f"{1e3 * one['median_s']:.1f} ms", f"{1e3 * BUILD_FLOOR:g} ms", f"{1e3 * BUILD_AIM:g} ms")
+    print(f"{figures['scene']}: {rays['several_hits']:.2%} of the rays with several hits, {rays['without_hit']:.2%} of "
+          "the texels without one")
+    limits = f"{1e3 * BUILD_FLOOR:g} ms", f"{1e3 * BUILD_AIM:g} ms"
+    rows = [(f"build, {name}", f"{1e3 * one['median_s']:.1f} ms", *limits)
             for name, one in figures["build"].items()]
     rows += [(f"frames, {name}", f"{1 / one['median_s']:.0f} a second", f"{FRAMES_FLOOR}", f"{FRAMES_AIM}")
              for name, one in figures["frames"].items()]

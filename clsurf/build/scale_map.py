@@ -125,7 +125,7 @@ def radial_bound(surface: ScaleMap, points: NDArray | None) -> float:
     from ..surface.cube import interpolated
     if points is None or not len(points):
         return float("nan")
-    points = points[:: max(1, len(points) // 20_000)] - surface.center
+    points = points[::max(1, len(points) // 8_000)] - surface.center
     distance = np.linalg.norm(points, axis=1)
     points, distance = points[distance > 0], distance[distance > 0]
     best = np.full(len(points), np.inf)
