@@ -4,7 +4,8 @@
 // cell that its triangles have found. Otherwise (a geosphere) the triangle itself is drawn, its normals interpolated.
 //
 // One work-item per tile (VW lanes are pixels of 4x4 blocks), or a work-group of 64 per tile (VW = 1: one bin's pixels at
-// a time). Twin: tests/reference/render_cells.py, tile_cells.
+// a time). Twins: the net's triangles by brute force, and the interpolated map itself (tests/test_render_scale_map.py,
+// test_tile_cells).
 #include "render/cells.clh"
 #include "common/planes.clh"
 #include "common/cube.clh"
