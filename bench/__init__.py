@@ -10,6 +10,7 @@ JOBS = {
     "build": "scan to SLIM surface: time, size, error, overlap, memory",
     "tiles": "frames: time, time per stage and tile, holes, silhouettes, depth and normals against ray casting",
     "channels": "channels of curvature: errors on a torus, cost on a frame",
+    "light": "materials, skies and anti-aliasing: energy, edges, cost on a frame",
     "lines": "feature lines: distance from analytic curves, frames with lines over them",
     "trace": "rays a second: primary, shadows, ambient occlusion, arbitrary ones, beside Embree",
     "sparsity": "surfels and floats by degree for one error, linear splats beside quadratic surfels",

@@ -10,7 +10,7 @@ from ..errors import InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
 from .color_maps import ChannelOption, LegendOption, LimitOption, channel_picture
 from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
-from .lights import LightOption, MirrorOption, OcclusionOption, ShadowsOption, lighting
+from .lights import LightOption, MaterialOption, MirrorOption, OcclusionOption, ShadowsOption, SkyOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .motion import (
     CameraOption,
@@ -21,6 +21,7 @@ from .motion import (
     TurntableOption,
     motion,
 )
+from .output import AntialiasOption, BackgroundOption, BitsOption, ExposureOption, ToneOption, output
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
 
 SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
@@ -35,7 +36,8 @@ FacesOption = Annotated[int, typer.Option(help="scale_map: subdivisions of the g
                                           "triangles.")]
 MapNormalsOption = Annotated[str, typer.Option(help="scale_map: auto, stored, neighbours or gradient.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
-LookOption = Annotated[str, typer.Option(help="phong, flat, reflection (lines); slim: ball_size, ball_level.")]
+LookOption = Annotated[str, typer.Option(help="phong, physical, matcap, normal, flat, reflection (lines); slim: "
+                                              "ball_size, ball_level.")]
 
 
 def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg, .exr.")] = Path("clsurf-demo.png"),
@@ -82,8 +84,11 @@ def render(source: SourceArgument,
            channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id, and "
                                                       "those of --channel; .png and .jpg show "
                                                       "color.")] = "color,depth,normal",
-           shading: LookOption = "phong", light: LightOption = None, shadows: ShadowsOption = False,
-           occlusion: OcclusionOption = 0, mirror: MirrorOption = 0.0, supersampling: SamplesOption = 1,
+           shading: LookOption = "phong", material: MaterialOption = "", light: LightOption = None,
+           sky: SkyOption = "", shadows: ShadowsOption = False, occlusion: OcclusionOption = 0,
+           mirror: MirrorOption = 0.0, background: BackgroundOption = "", supersampling: SamplesOption = 1,
+           antialias: AntialiasOption = "none", tone: ToneOption = "none", exposure: ExposureOption = 0.0,
+           bits: BitsOption = 8,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
@@ -95,7 +100,6 @@ def render(source: SourceArgument,
     import clsurf
 
     from ..device import Profile
-    from ..render.average import checked_supersampling
     from ..render.renderer import checked_channels, checked_lod, checked_size
     # Every option is checked before the work.
     seen_from = direction or eye or target or (fov, ortho) != (None, None)
@@ -110,10 +114,12 @@ def render(source: SourceArgument,
                          "write .exr")
     view = checked_view(direction, up, fov, eye, target, ortho)
     how = recipe(kind, degree, error, patches=patches, spacing=spacing)
-    lit = lighting(shading, light, shadows, occlusion, mirror)
+    lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
-    checked_supersampling(supersampling)
+    written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel)
+    if written.background == "sky" and not sky:
+        raise InputError("--background sky: expected --sky beside it")
     if colored:
         colored.prepared(how, degree)
     chosen = clsurf.open_device(device or None)
@@ -127,7 +133,8 @@ def render(source: SourceArgument,
         if colored:
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
-                              device=chosen, supersampling=supersampling, patches=drawing, scale_map=scale_map)
+                              written.background, chosen, supersampling=supersampling, patches=drawing,
+                              antialias=written.antialias, scale_map=scale_map)
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
@@ -146,7 +153,7 @@ def render(source: SourceArgument,
         strokes.save(out, frame, None if coarse is thing else coarse, seen, picture_size, chosen, steps)
     elif not moving.moves:
         with steps.step("write"):
-            frame.save(out)
+            written.save(frame, out)
     steps.say(f"{'video' if moving.moves else 'picture'}: {out.resolve()}")
 
 

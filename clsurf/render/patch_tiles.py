@@ -34,7 +34,7 @@ def tile_patches(device: Device, scratch: Scratch, grid: Grid, upload, constants
         "TRIANGLES": look.patches.cells == "triangles", "EQUAL_NODES": upload.equal_nodes, "FUSED": out is not None,
         "LATTICE": look.patches.cells in CELLS, "SMOOTH": look.patches.cells == "smooth",
         "SMOOTH_NORMALS": look.patches.normals == "smooth", "ALPHA_TEST": look.patches.alpha,
-        "COUNT_COST": look.cost or (out is not None and "cost" in out)}
+        "COUNT_COST": look.cost or (out is not None and "cost" in out), "MASKED": int(grid.masked)}
     twists = upload.steps
     if constants["SMOOTH"] or constants["SMOOTH_NORMALS"]:
         twists = upload.once("twists", lambda surface: device.upload(np.pad(node_twists(surface), (0, PAD))))

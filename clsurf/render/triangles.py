@@ -98,7 +98,7 @@ def project_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: T
         (runs,), (16,), view, points, triangles.faces, faces, runs, touch.full, touch.core, touch.keys, touch.buckets)
     # In a grid whose bins are the tiles.
     tiles = [-(-n // grid.patch_bins) for n in (grid.bins_x, grid.bins_y)]
-    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN))
+    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN), masked=False)
     return points, bin_pairs(device, scratch, coarse, touch, runs)
 
 
@@ -122,7 +122,7 @@ def draw_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: Tria
     colors = triangles.colors if grid.layout.color and look.shading.model_colors else None
     constants = grid.layout.constants | {
         "VW": scratch.lanes, "TILE_BINS": grid.patch_bins, "HAS_NORMALS": triangles.normals is not None,
-        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost}
+        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost, "MASKED": int(grid.masked)}
     tiles_x, group = -(-grid.bins_x // grid.patch_bins), 64 if scratch.lanes == 1 else 1
     tiles = tiles_x * -(-grid.bins_y // grid.patch_bins)
     device.kernel("render/tile_triangles.cl", constants=constants)(

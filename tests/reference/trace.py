@@ -63,18 +63,18 @@ def light_bins(view, shading, pixels, depth, gradient, base, shadows, directions
     `shadows` (p,) are bits of lamps; `hidden` (p, n) says which of the `directions` (n, 3) a point does not see.
     """
     s = np.array(shading, np.float64)
-    lamps = s[16:].reshape(-1, 8)
+    lamps = s[16:].reshape(-1, 16)
     unit = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     open_part = np.ones(len(pixels))
     if directions is not None:
         weight = np.clip(unit @ np.asarray(directions, np.float64).T, 0, None)
         open_part = np.where(hidden, 0, weight).sum(axis=1) / weight.sum(axis=1)
-    alone = np.concatenate([s[:16], np.zeros(8)])
+    alone = np.concatenate([s[:16], np.zeros(16)])
     alone[12] = 1
     color = base * s[3] * open_part[:, None]
     alone[3] = 0
     for i, lamp in enumerate(lamps[:int(s[12])]):
-        alone[16:24] = lamp
+        alone[16:32] = lamp
         seen = 1 - (np.asarray(shadows) >> i & 1)
         color = color + seen[:, None] * render.shade(view, alone, pixels, depth, gradient, base)[:, :3]
     return color
