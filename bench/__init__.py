@@ -1,6 +1,6 @@
 """Benchmarks: each job checks its answer, then prints figures with the device, driver, commit and scene beside them.
 
-`clsurf bench build|tiles|normals|patches [--json FILE]`, `clsurf bench compare A B`;
+`clsurf bench build|tiles|normals|patches|scale_map [--json FILE]`, `clsurf bench compare A B`;
 `python -m bench.report FILE` runs all.
 """
 
@@ -21,6 +21,7 @@ JOBS = {
     "fuzz": "damaged files of every format: crashes, hangs, memory",
     "devices": "one answer everywhere: hashes of all devices' answers and how far they are apart",
     "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",
+    "scale_map": "spherical scale maps: closed forms and orders, builds, frames, geospheres, morphs",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 

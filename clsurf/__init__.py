@@ -13,6 +13,7 @@ from .analysis.line_surface import line_surface
 from .analysis.lines import line_channels, lines
 from .analysis.smooth import smooth
 from .analysis.sparsity import slim_of_error, sparsity
+from .build.morph import morph
 from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
@@ -56,6 +57,6 @@ __all__ = [
     "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface", "SurfaceError",
     "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim", "build_surfels",
     "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load",
-    "load_cameras", "load_frames", "models", "open_device", "project", "render", "render_frames", "report", "save",
-    "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable", "view", "write_video",
+    "load_cameras", "load_frames", "models", "morph", "open_device", "project", "render", "render_frames", "report",
+    "save", "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable", "view", "write_video",
 ]

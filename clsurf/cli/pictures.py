@@ -56,6 +56,10 @@ NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, ex
 CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
 AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, up to half "
                                            "their alpha.")]
+FormOption = Annotated[str, typer.Option(help="scale_map: cast (rays of pixels) or geosphere.")]
+FacesOption = Annotated[int, typer.Option(help="scale_map: subdivisions of the geosphere, 0 to 9; 6: 81,920 "
+                                          "triangles.")]
+MapNormalsOption = Annotated[str, typer.Option(help="scale_map: auto, stored, neighbours or gradient.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
 LookOption = Annotated[str, typer.Option(help="phong, physical, matcap, normal, flat, reflection (lines); slim: "
                                               "ball_size, ball_level.")]
@@ -114,6 +118,7 @@ def render(source: SourceArgument,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
            interior: InteriorOption = 16.0, no_maps: NoMapsOption = False,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
+           form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
            profile: ProfileOption = False, device: DeviceOption = "", quiet: QuietOption = False):
@@ -138,6 +143,7 @@ def render(source: SourceArgument,
     surfels = clsurf.SurfelDrawing(interior, not no_maps)
     lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
     written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel)
     if written.background == "sky" and not sky:
         raise InputError("--background sky: expected --sky beside it")
@@ -155,7 +161,7 @@ def render(source: SourceArgument,
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
                               written.background, chosen, supersampling=supersampling, patches=drawing,
-                              surfels=surfels, antialias=written.antialias)
+                              surfels=surfels, scale_map=scale_map, antialias=written.antialias)
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
