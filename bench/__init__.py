@@ -1,6 +1,6 @@
 """Benchmarks: each job checks its answer, then prints figures with the device, driver, commit and scene beside them.
 
-`clsurf bench build|tiles|normals|patches [--json FILE]`, `clsurf bench compare A B`;
+`clsurf bench build|tiles|normals|scans|patches [--json FILE]`, `clsurf bench compare A B`;
 `python -m bench.report FILE` runs all.
 """
 
@@ -16,6 +16,7 @@ JOBS = {
     "normals": "neighbours, normals and their orientation",
     "curvature": "curvature at points: error and time on tori, MeshLab's filters",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
+    "scans": "meshes and clouds drawn as they are: errors against ray casting, frames, VTK",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 

@@ -23,6 +23,7 @@ from .io import load, load_frames, save
 from .render.camera import Camera
 from .render.frame import Frame
 from .render.patch_drawing import PatchDrawing
+from .render.point_drawing import PointDrawing
 from .render.renderer import Renderer, render
 from .render.scene import Scene
 from .render.shade import Light, Shading
@@ -39,9 +40,10 @@ from .trace.hits import Hits, trace
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
-    "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
-    "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
+    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing",
+    "PatchSurface", "Placed", "PointCloud", "PointDrawing", "Profile", "Projection", "RangeImage", "RangeScan",
+    "Renderer", "Scene", "Shading", "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim",
+    "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines",
+    "load", "load_frames", "models", "open_device", "project", "render", "report", "save", "slim_of_error",
+    "smooth", "sparsity", "trace",
 ]

@@ -12,6 +12,7 @@ from .color_maps import ChannelOption, LegendOption, LimitOption, channel_pictur
 from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
 from .lights import LightOption, MirrorOption, OcclusionOption, ShadowsOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
+from .raw_scans import AsOption, AttributeOption, EyeDomeOption, PointSizeOption, point_drawing, wants_scan
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
 
 SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
@@ -69,11 +70,12 @@ def render(source: SourceArgument,
            occlusion: OcclusionOption = 0, mirror: MirrorOption = 0.0, supersampling: SamplesOption = 1,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
-           lines: LinesOption = "", on_white: OnWhiteOption = False,
+           lines: LinesOption = "", on_white: OnWhiteOption = False, drawn_as: AsOption = "surface",
+           point_size: PointSizeOption = "", eye_dome: EyeDomeOption = None, attribute: AttributeOption = "",
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
            quiet: QuietOption = False):
-    """Draw a surface or a scan into a picture."""
+    """Draw a surface, or a scan or its surface, into a picture."""
     import clsurf
 
     from ..device import Profile
@@ -92,6 +94,7 @@ def render(source: SourceArgument,
     lit = lighting(shading, light, shadows, occlusion, mirror)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     checked_supersampling(supersampling)
+    as_it_is, points = wants_scan(drawn_as, lines, channel, kind), point_drawing(point_size, eye_dome, attribute)
     if colored:
         colored.prepared(how, degree)
     chosen = clsurf.open_device(device or None)
@@ -99,7 +102,7 @@ def render(source: SourceArgument,
         thing, coarse = strokes.surfaces(source, how, chosen, steps)
         wanted = strokes.channels(wanted, coarse is thing)
     else:
-        thing = loaded_surface(source, how, chosen, steps)
+        thing = loaded_surface(source, how, chosen, steps, as_it_is)
     camera = view.camera(thing, picture_size)
     chosen.profile = Profile() if profile else None
     with steps.step("draw"):
@@ -107,7 +110,7 @@ def render(source: SourceArgument,
             frame = colored.draw(thing, camera, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         else:
             frame = clsurf.render(lit.scene(thing, camera), camera, picture_size, wanted, lit.shading, lod,
-                                  device=chosen, supersampling=supersampling, patches=drawing)
+                                  device=chosen, supersampling=supersampling, patches=drawing, points=points)
     if profile:
         print(chosen.profile)
         chosen.profile = None
@@ -143,13 +146,13 @@ def report(source: SourceArgument,
     steps.say(f"page: {out.resolve()}")
 
 
-def loaded_surface(source: Path, how: Recipe, device, steps: Steps):
-    """Return the surface in the file `source`, or the one built from the scan in it."""
+def loaded_surface(source: Path, how: Recipe, device, steps: Steps, as_it_is: bool = False):
+    """Return the surface in the file `source`, or the one built from the scan in it; `as_it_is`: the scan."""
     import clsurf
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
+    if not as_it_is and not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
         with steps.step("build"):
             thing = how.build(thing, device, steps)
         steps.say(f"  {thing}")

@@ -7,12 +7,15 @@ import numpy as np
 
 from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
+from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
+from ..surface.ranges import RangeScan
 from ..surface.slim import SlimSurface
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
+from .eye_dome import eye_dome
 from .frame import Frame
 from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
@@ -20,7 +23,9 @@ from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
-from .scene import as_scene
+from .point_drawing import PointDrawing
+from .points import draw_points, is_unlit, upload_cloud
+from .scene import as_scene, without_points
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
@@ -29,9 +34,11 @@ from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
-         Mesh: (upload_mesh, draw_mesh)}
+         Mesh: (upload_mesh, draw_mesh), PointCloud: (upload_cloud, draw_points),
+         RangeScan: (upload_cloud, draw_points)}
 # Made and checked once: 14 us.
 DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM = Shading(), PatchDrawing(), SlimDrawing()
+DEFAULT_POINTS = PointDrawing()
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -72,7 +79,7 @@ class Renderer:
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None) -> Frame:
+               slim: SlimDrawing | None = None, points: PointDrawing | None = None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -106,6 +113,8 @@ class Renderer:
             How spatial patches are drawn.
         slim : SlimDrawing, optional
             How SLIM surfaces are drawn.
+        points : PointDrawing, optional
+            How point clouds and the points of range images are drawn.
 
         Returns
         -------
@@ -137,6 +146,9 @@ class Renderer:
         slim = DEFAULT_SLIM if slim is None else slim
         if not isinstance(slim, SlimDrawing):
             raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
+        points = DEFAULT_POINTS if points is None else points
+        if not isinstance(points, PointDrawing):
+            raise InputError(f"points: expected a clsurf.PointDrawing, got {points!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
@@ -147,7 +159,7 @@ class Renderer:
             placed, origin = scene.placed, scene_origin(scene)
             traced = wants_traced_light(shading, channels)
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not traced
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, planes=not at_once)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, points, planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             if at_once:
@@ -156,11 +168,15 @@ class Renderer:
                                        whole, floats, channels)
             else:
                 lamps = self.device.upload(floats)
+                look = Look(shading, lod, patches, slim, lamps, "cost" in channels, points)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, slim, lamps, "cost" in channels), number)
+                                            look, number)
+                if grid.layout.unlit and points.eye_dome is not False:
+                    eye_dome(self.device, self._scratch, grid, points, camera, factor)
                 if traced:
-                    light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
+                    light_grid(self.device, self._scratch, grid, without_points(scene), camera, shading, floats,
+                               lamps)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
                                shading.look, channels)
             if wants_mirror(shading, channels):
@@ -177,18 +193,18 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, planes: bool) -> Grid:
+    def _new_grid(self, placed, size, channels, curved, shading, patches, points, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
-        colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
-                                               for s, _ in placed)
-        colored |= shading.look.startswith("ball")
+        colored = shading.model_colors and any(carries_colors(s) for s, _ in placed)
+        colored |= shading.look.startswith("ball") or points.attribute is not None
+        unlit = any(is_unlit(s, points, shading) for s, _ in placed)
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed)
         traced = wants_traced_light(shading, channels)
-        layout = Layout(color=(colored or lit or traced) and "color" in channels, id="id" in channels,
+        layout = Layout(color=(colored or lit or traced or unlit) and "color" in channels, id="id" in channels,
                         count="count" in channels, level="level" in channels, lit=lit, traced=traced,
-                        differentials=curved)
+                        unlit=unlit and "color" in channels, differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,
@@ -224,6 +240,13 @@ class Renderer:
 
     def __exit__(self, *error):
         self.close()
+
+
+def carries_colors(surface) -> bool:
+    """Return whether a surface or a scan has colours of its own."""
+    if isinstance(surface, RangeScan):
+        return all(image.color is not None for image in surface.images)
+    return any(getattr(surface, name, None) is not None for name in ("colors", "color", "texture"))
 
 
 def scene_origin(scene) -> np.ndarray:
@@ -266,13 +289,14 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None,
+           points: PointDrawing | None = None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim)
+                                                supersampling, patches, slim, points)
 
 
 _shared = threading.local()

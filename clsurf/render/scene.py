@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
+from ..surface.ranges import RangeScan
 from ..surface.slim import SlimSurface
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface, Mesh)
+DRAWABLE = (SlimSurface, PatchSurface, Mesh, PointCloud, RangeScan)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,6 +64,12 @@ class Scene:
         if not boxes:
             return np.full((2, 3), np.nan)
         return np.stack([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
+
+
+def without_points(scene: Scene) -> Scene:
+    """Return the scene without its points, which no ray can meet."""
+    kept = [s for s in scene.surfaces if not isinstance(getattr(s, "surface", s), PointCloud | RangeScan)]
+    return scene if len(kept) == len(scene.surfaces) else Scene(kept, scene.lights)
 
 
 def as_scene(thing) -> Scene:

@@ -1,6 +1,6 @@
 """Shading: material, lights, background, and the last stage, which writes the channels of the picture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from ..errors import InputError
 from ..surface.srgb import to_linear
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
+from .point_drawing import PointDrawing
 from .slim_drawing import SlimDrawing
 from .tiles import BIN, Grid, Scratch
 
@@ -135,6 +136,7 @@ class Look:
     slim: SlimDrawing
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
+    points: PointDrawing = field(default_factory=PointDrawing)
 
 
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:

@@ -28,6 +28,7 @@ class Layout:
     level: bool = False
     lit: bool = False  # colours of patches are lit at their nodes
     traced: bool = False  # colours are lit before the last stage, where rays decide over the light
+    unlit: bool = False  # some colours are final and take no light
     differentials: tuple[str, ...] = ()  # channels of curvature, in the order of their planes
 
     @property
@@ -46,7 +47,7 @@ class Layout:
         if self.differentials:
             out |= field_constants(self.differentials, at)
             at += self.differential_planes
-        return out | {"FIELDS": at, "LIT_COLORS": self.lit or self.traced}
+        return out | {"FIELDS": at, "LIT_COLORS": self.lit or self.traced or self.unlit}
 
 
 @dataclass(frozen=True, eq=False)
