@@ -223,7 +223,7 @@ def draw_points(device: Device, scratch: Scratch, grid: Grid, upload: CloudUploa
         colors = attribute_colors(device, upload, drawing.attribute)
     elif grid.layout.color and shading.model_colors:
         colors = upload.colors
-    view = device.upload(place_points(upload, matrix, camera, grid.size, look))
+    view = device.upload(grid.clip_into(place_points(upload, matrix, camera, grid.size, look)))
     drawn, boxes, pairs = project_points(device, scratch, grid, upload, view, look.lod)
     if pairs is None:
         return

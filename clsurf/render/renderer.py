@@ -1,5 +1,6 @@
 """The renderer: a list of stages from a scene to a frame."""
 
+import os
 import threading
 import weakref
 
@@ -11,9 +12,12 @@ from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.ranges import RangeScan
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
+from .clip import checked_clip, view_clip
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .eye_dome import eye_dome
 from .frame import Frame
@@ -25,20 +29,25 @@ from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
 from .point_drawing import PointDrawing
 from .points import draw_points, is_unlit, upload_cloud
+from .scale_map import draw_scale_map, upload_scale_map
+from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene, without_points
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
+from .surfels import draw_surfels, upload_surfels
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
+         SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
          Mesh: (upload_mesh, draw_mesh), PointCloud: (upload_cloud, draw_points),
          RangeScan: (upload_cloud, draw_points)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM = Shading(), PatchDrawing(), SlimDrawing()
-DEFAULT_POINTS = PointDrawing()
+DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP, DEFAULT_POINTS = (
+    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing(), PointDrawing())
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -79,7 +88,8 @@ class Renderer:
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None, points: PointDrawing | None = None) -> Frame:
+               slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+               scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None, clip=None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -92,7 +102,8 @@ class Renderer:
         channels : sequence of str
             Of "color", "depth", "normal", "position", "id", "count", "level", "cost" (see `Frame`); "cost" is the
             number of surfel evaluations per pixel of the pixel's bin of 8x8, or that of tests of a pixel against a
-            cell of a patch. For patches "count" is 1 and "level" the mip level, 0 for the patch's own nodes.
+            cell of a patch or a scale map. For patches "count" is 1 and "level" the mip level, 0 for the patch's own
+            nodes; for scale maps 1 and the layer.
             Curvature of SLIM surfaces (float32, NaN elsewhere), from blended derivatives of the surfels (paper,
             equation 8, left), world units: "mean", "gaussian", "k1" >= "k2" (1/length; positive where the surface
             curves away from the side its stored normals point to, that of the eye where it is not oriented),
@@ -113,8 +124,15 @@ class Renderer:
             How spatial patches are drawn.
         slim : SlimDrawing, optional
             How SLIM surfaces are drawn.
+        surfels : SurfelDrawing, optional
+            How surfel hierarchies are drawn.
+        scale_map : ScaleMapDrawing, optional
+            How scale maps are drawn.
         points : PointDrawing, optional
             How point clouds and the points of range images are drawn.
+        clip : (4,) or (n, 4) array_like, optional
+            Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
+            that the inside is seen. What is cut off still throws shadows and is seen in mirrors.
 
         Returns
         -------
@@ -129,8 +147,10 @@ class Renderer:
         """
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
+        if self.device.process != os.getpid():
+            raise DeviceError("renderer: it was made before this process was forked: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
-        factor = checked_supersampling(supersampling)
+        factor, clip = checked_supersampling(supersampling), checked_clip(clip)
         picture, size = size, checked_size([n * factor for n in size])
         asked, channels = channels, fine_channels(channels, factor)
         curved = wanted_differentials(channels)
@@ -146,6 +166,12 @@ class Renderer:
         slim = DEFAULT_SLIM if slim is None else slim
         if not isinstance(slim, SlimDrawing):
             raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
+        surfels = DEFAULT_SURFELS if surfels is None else surfels
+        if not isinstance(surfels, SurfelDrawing):
+            raise InputError(f"surfels: expected a clsurf.SurfelDrawing, got {surfels!r}")
+        scale_map = DEFAULT_SCALE_MAP if scale_map is None else scale_map
+        if not isinstance(scale_map, ScaleMapDrawing):
+            raise InputError(f"scale_map: expected a clsurf.ScaleMapDrawing, got {scale_map!r}")
         points = DEFAULT_POINTS if points is None else points
         if not isinstance(points, PointDrawing):
             raise InputError(f"points: expected a clsurf.PointDrawing, got {points!r}")
@@ -159,7 +185,8 @@ class Renderer:
             placed, origin = scene.placed, scene_origin(scene)
             traced = wants_traced_light(shading, channels)
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not traced
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, points, planes=not at_once)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, points,
+                                  view_clip(clip, camera), planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             if at_once:
@@ -168,7 +195,7 @@ class Renderer:
                                        whole, floats, channels)
             else:
                 lamps = self.device.upload(floats)
-                look = Look(shading, lod, patches, slim, lamps, "cost" in channels, points)
+                look = Look(shading, lod, patches, slim, surfels, scale_map, lamps, "cost" in channels, points)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
                                             look, number)
@@ -193,7 +220,7 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, points, planes: bool) -> Grid:
+    def _new_grid(self, placed, size, channels, curved, shading, patches, points, clip, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
         colored = shading.model_colors and any(carries_colors(s) for s, _ in placed)
         colored |= shading.look.startswith("ball") or points.attribute is not None
@@ -204,7 +231,8 @@ class Renderer:
         traced = wants_traced_light(shading, channels)
         layout = Layout(color=(colored or lit or traced or unlit) and "color" in channels, id="id" in channels,
                         count="count" in channels, level="level" in channels, lit=lit, traced=traced,
-                        unlit=unlit and "color" in channels, differentials=curved)
+                        clip_planes=len(clip), unlit=unlit and "color" in channels,
+                        differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,
@@ -212,11 +240,11 @@ class Renderer:
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
         patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
         if not planes:
-            return Grid(size, self.tile_bins, layout, None, None, patch_bins)
+            return Grid(size, self.tile_bins, layout, None, None, patch_bins, clip)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
         return Grid(size, self.tile_bins, layout, touched,
-                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins)
+                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins, clip)
 
     def _uploaded(self, surface):
         upload = self._uploads.get(surface)
@@ -289,14 +317,15 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None,
-           points: PointDrawing | None = None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+           scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None,
+           clip=None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim, points)
+                                                supersampling, patches, slim, surfels, scale_map, points, clip)
 
 
 _shared = threading.local()

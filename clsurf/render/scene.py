@@ -11,10 +11,12 @@ from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
 from ..surface.ranges import RangeScan
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface, Mesh, PointCloud, RangeScan)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, PointCloud, RangeScan)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,7 +49,7 @@ class Scene:
             if not isinstance(own, DRAWABLE):
                 raise InputError(f"scene: surface {i} is a {type(own).__name__}, expected one of "
                                  f"{', '.join(kind.__name__ for kind in DRAWABLE)}, plain or placed: build a surface "
-                                 "from a scan first (clsurf.build_slim, clsurf.build_patches)")
+                                 "from a scan first (clsurf.build_slim, clsurf.build_patches, clsurf.build_scale_map)")
 
     def __repr__(self):
         return f"Scene({len(self.surfaces)} surfaces, {len(self.lights)} lights)"

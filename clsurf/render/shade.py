@@ -10,7 +10,9 @@ from ..surface.srgb import to_linear
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
 from .point_drawing import PointDrawing
+from .scale_map_drawing import ScaleMapDrawing
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
 from .tiles import BIN, Grid, Scratch
 
 CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np.float32), "position": (3, np.float32),
@@ -134,6 +136,8 @@ class Look:
     lod: float
     patches: PatchDrawing
     slim: SlimDrawing
+    surfels: SurfelDrawing = field(default_factory=SurfelDrawing)
+    scale_map: ScaleMapDrawing = field(default_factory=ScaleMapDrawing)
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
     points: PointDrawing = field(default_factory=PointDrawing)

@@ -117,14 +117,14 @@ def draw_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: Tria
 
     Parameters
     ----------
-    floats : (32,) float32
+    floats : (64,) float32
         View buffer, of `place_triangles`.
     number : int
         The surface's place in the scene, for the channel "id".
     """
     if not len(triangles.faces):
         return
-    view = device.upload(floats)
+    view = device.upload(grid.clip_into(floats))
     points, boxes, pairs = project_triangles(device, scratch, grid, triangles, view)
     if pairs is None:
         return
