@@ -1,6 +1,6 @@
 """Benchmarks: each job checks its answer, then prints figures with the device, driver, commit and scene beside them.
 
-`clsurf bench build|tiles|normals|patches|scale_map [--json FILE]`, `clsurf bench compare A B`;
+`clsurf bench build|tiles|normals|scans|patches|surfels|scale_map [--json FILE]`, `clsurf bench compare A B`;
 `python -m bench.report FILE` runs all.
 """
 
@@ -18,6 +18,7 @@ JOBS = {
     "curvature": "curvature at points: error and time on tori, MeshLab's filters",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
     "surfels": "surfel hierarchies: normal maps against float64, builds, normals by map size, frames beside SLIM",
+    "scans": "meshes and clouds drawn as they are: errors against ray casting, frames, VTK",
     "fuzz": "damaged files of every format: crashes, hangs, memory",
     "devices": "one answer everywhere: hashes of all devices' answers and how far they are apart",
     "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",

@@ -30,6 +30,7 @@ from .render.frame import Frame
 from .render.light import Light
 from .render.material import Material
 from .render.patch_drawing import PatchDrawing
+from .render.point_drawing import PointDrawing
 from .render.renderer import Renderer, render
 from .render.scale_map_drawing import ScaleMapDrawing
 from .render.scene import Scene
@@ -53,10 +54,11 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Material", "Mesh",
-    "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan",
-    "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface", "SurfaceError",
-    "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim", "build_surfels",
-    "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load",
-    "load_cameras", "load_frames", "models", "morph", "open_device", "project", "render", "render_frames", "report",
-    "save", "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable", "view", "write_video",
+    "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "PointDrawing", "Profile", "Projection", "RangeImage",
+    "RangeScan", "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface",
+    "SurfaceError", "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim",
+    "build_surfels", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface",
+    "lines", "load", "load_cameras", "load_frames", "models", "morph", "open_device", "project", "render",
+    "render_frames", "report", "save", "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable",
+    "view", "write_video",
 ]

@@ -185,8 +185,8 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
     from ..io.dispatch import WRITES
     from ..io.scans import WRITES as SCANS
     from ..surface.patch_mesh import patch_mesh
-    from ..surface.surfel import finest_scan
     from ..surface.scale_mesh import scale_mesh
+    from ..surface.surfel import finest_scan
     steps = Steps(quiet)
     checked_out(out, WRITES)
     with steps.step("load"):

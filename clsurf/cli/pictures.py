@@ -32,6 +32,7 @@ from .motion import (
     motion,
 )
 from .output import AntialiasOption, BackgroundOption, BitsOption, ExposureOption, ToneOption, output
+from .raw_scans import AsOption, AttributeOption, EyeDomeOption, PointSizeOption, point_drawing, wants_scan
 from .recipe import (
     DegreeOption,
     ErrorOption,
@@ -119,10 +120,12 @@ def render(source: SourceArgument,
            interior: InteriorOption = 16.0, no_maps: NoMapsOption = False,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
            form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
-           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
-           spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
-           profile: ProfileOption = False, device: DeviceOption = "", quiet: QuietOption = False):
-    """Draw a surface or a scan into a picture, or into a moving one."""
+           drawn_as: AsOption = "surface", point_size: PointSizeOption = "", eye_dome: EyeDomeOption = None,
+           attribute: AttributeOption = "", kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "",
+           patches: PatchesOption = None, spacing: SpacingOption = None, map_size: MapSizeOption = None,
+           hybrid: HybridOption = False, profile: ProfileOption = False, device: DeviceOption = "",
+           quiet: QuietOption = False):
+    """Draw a surface, or a scan or its surface, into a picture, or into a moving one."""
     import clsurf
 
     from ..device import Profile
@@ -147,6 +150,7 @@ def render(source: SourceArgument,
     written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel)
     if written.background == "sky" and not sky:
         raise InputError("--background sky: expected --sky beside it")
+    as_it_is, points = wants_scan(drawn_as, lines, channel, kind), point_drawing(point_size, eye_dome, attribute)
     if colored:
         colored.prepared(how, degree)
     chosen = clsurf.open_device(device or None)
@@ -154,14 +158,14 @@ def render(source: SourceArgument,
         thing, coarse = strokes.surfaces(source, how, chosen, steps)
         wanted = strokes.channels(wanted, coarse is thing)
     else:
-        thing = loaded_surface(source, how, chosen, steps)
+        thing = loaded_surface(source, how, chosen, steps, as_it_is)
 
     def drawn(seen):
         if colored:
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
                               written.background, chosen, supersampling=supersampling, patches=drawing,
-                              surfels=surfels, scale_map=scale_map, antialias=written.antialias)
+                              surfels=surfels, scale_map=scale_map, points=points, antialias=written.antialias)
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
@@ -209,13 +213,13 @@ def report(source: SourceArgument,
     steps.say(f"page: {out.resolve()}")
 
 
-def loaded_surface(source: Path, how: Recipe, device, steps: Steps):
-    """Return the surface in the file `source`, or the one built from the scan in it."""
+def loaded_surface(source: Path, how: Recipe, device, steps: Steps, as_it_is: bool = False):
+    """Return the surface in the file `source`, or the one built from the scan in it; `as_it_is`: the scan."""
     import clsurf
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if not is_surface(thing):
+    if not as_it_is and not is_surface(thing):
         with steps.step("build"):
             thing = how.build(thing, device, steps)
         steps.say(f"  {thing}")

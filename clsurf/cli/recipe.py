@@ -41,13 +41,10 @@ HybridOption = Annotated[bool, typer.Option("--hybrid", help="surfels: the mesh'
 class Recipe:
     """A kind of surface and the options it is built with, checked."""
 
-    kind: str  # "slim", "patches", "surfels", or "": by the scan
+    kind: str  # one of `KINDS`, or "": by the scan
     slim: dict = field(default_factory=dict)
     patches: dict = field(default_factory=dict)
     surfels: dict = field(default_factory=dict)
-    kind: str  # "slim", "patches", "scale_map", or "": by the scan
-    slim: dict = field(default_factory=dict)
-    patches: dict = field(default_factory=dict)
     scale_map: dict = field(default_factory=dict)
 
     def kind_for(self, scan) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
-from ..trace.kinds import ANY, Traced, traced
+from ..trace.kinds import ANY, Traced, traceable, traced
 from ..trace.packets import packet_lanes, trace_lights
 from ..trace.single import HIT_FLOATS, RAY_FLOATS, placement
 from .tiles import Grid, Scratch, view_floats
@@ -44,6 +44,8 @@ def casters_of(device: Device, grid: Grid, scene, camera) -> Casters:
     """Return what casts in a scene whose bins are drawn."""
     packets, singles = [], []
     for surface, matrix in scene.placed:
+        if not traceable(surface):
+            continue
         held = traced(device, surface)
         if held.empty:
             continue

@@ -4,13 +4,15 @@ The rays are those of `clsurf.trace`, so that every surface of a scene is reflec
 Kernel: kernels/render/light_points.cl.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..surface.srgb import to_linear
 from ..trace.hits import Hits, trace
-from ..trace.kinds import traced
+from ..trace.kinds import traceable, traced
 from .backdrop import Backdrop
 from .light import KINDS, LIGHT_FLOATS
 from .lighting import Lighting, surface_shading
@@ -21,6 +23,7 @@ from .tiles import view_floats
 CHANNELS = ("position", "normal", "id")  # that a picture needs for it
 # Where a ray starts, in node spacings of patches or median radii of surfels: up the normal, and along itself.
 LIFT, START = 0.05, 0.5
+POINT_GRAIN = 0.002  # of the extent of a cloud
 POINT_FLOATS, SPAN = 16, 64  # kernels/render/light_points.cl
 
 
@@ -45,7 +48,17 @@ def mirror_shares(scene, shading: Shading) -> NDArray:
 
 def grain(device: Device, surface, matrix) -> float:
     """Return the length (world units) within which a surface's own points are no obstacles to rays from it."""
-    return (1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))) * traced(device, surface).grain
+    scale = 1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    if not traceable(surface):  # points, whose extent is their picture's
+        return scale * POINT_GRAIN * float(np.nan_to_num(np.linalg.norm(np.ptp(surface.bounds, axis=0))))
+    return scale * traced(device, surface).grain
+
+
+def met(scene, origins, directions, query: str = "closest", device=None, **limits) -> Hits:
+    """Return what `trace` does for the surfaces of a scene that rays can meet; numbers are the scene's."""
+    numbers = [number for number, (surface, _) in enumerate(scene.placed) if traceable(surface)]
+    hits = trace([scene.surfaces[number] for number in numbers], origins, directions, query, device=device, **limits)
+    return replace(hits, surface=np.append(numbers, -1).astype(np.int32)[hits.surface])
 
 
 def reflect(device: Device, scene, camera, shading: Shading, backdrop: Backdrop, origin: NDArray, floats: NDArray,
@@ -68,7 +81,7 @@ def reflect(device: Device, scene, camera, shading: Shading, backdrop: Backdrop,
     sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
     ray = sight - 2 * (sight * normals).sum(axis=1, keepdims=True) * normals
     step = np.array(grains)[number]
-    hits = trace(scene, points + LIFT * step[:, None] * normals, ray, near=START * step, device=device)
+    hits = met(scene, points + LIFT * step[:, None] * normals, ray, near=START * step, device=device)
     seen = backdrop.seen(ray, camera)
     if hits.hit.any():
         seen[hits.hit] = lit(device, scene, camera, shading, hits, ray, floats, lighting)
@@ -115,8 +128,8 @@ def shadow_bits(device: Device, scene, points: NDArray, normals: NDArray, step: 
         away = np.linalg.norm(to, axis=1, keepdims=True)
         to = to / np.maximum(away, 1e-300)
         seen = np.flatnonzero((normals * to).sum(axis=1) > 0)
-        hidden = trace(scene, points[seen] + LIFT * step[seen, None] * normals[seen], to[seen], "any",
-                       near=START * step[seen], far=away[seen, 0] if near else np.inf, device=device).hit
+        hidden = met(scene, points[seen] + LIFT * step[seen, None] * normals[seen], to[seen], "any",
+                     near=START * step[seen], far=away[seen, 0] if near else np.inf, device=device).hit
         bits[seen[hidden]] |= np.uint32(1 << bit)
     return bits
 
@@ -127,7 +140,6 @@ def base_colors(device: Device, scene, shading: Shading, surface: NDArray, primi
     for number, (own, _) in enumerate(scene.placed):
         here, look = surface == number, surface_shading(scene, shading, number)
         out[here] = to_linear(look.color)
-        colors = traced(device, own).colors
-        if look.model_colors and colors is not None and here.any():
-            out[here] = colors(primitive[here])
+        if look.model_colors and here.any() and traced(device, own).colors is not None:
+            out[here] = traced(device, own).colors(primitive[here])
     return out

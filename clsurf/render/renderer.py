@@ -9,8 +9,10 @@ import numpy as np
 
 from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
+from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
+from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
@@ -20,6 +22,7 @@ from .camera import Camera
 from .clip import checked_clip, view_clip
 from .coverage import FACTOR, checked_antialias, cover_edges, edge_channels, edge_layout, mark_edges
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
+from .eye_dome import eye_dome
 from .frame import Frame
 from .lighting import OWN_COLORS, prepared_lighting, surface_shading, wants_lighting
 from .mesh import draw_mesh, upload_mesh
@@ -28,6 +31,8 @@ from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
+from .point_drawing import PointDrawing
+from .points import draw_points, is_unlit, upload_cloud
 from .scale_map import draw_scale_map, upload_scale_map
 from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene
@@ -42,10 +47,11 @@ from .traced_light import light_grid
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
          SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
-         Mesh: (upload_mesh, draw_mesh)}
+         Mesh: (upload_mesh, draw_mesh), PointCloud: (upload_cloud, draw_points),
+         RangeScan: (upload_cloud, draw_points)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP = (
-    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing())
+DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP, DEFAULT_POINTS = (
+    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing(), PointDrawing())
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -87,7 +93,8 @@ class Renderer:
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
                slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
-               scale_map: ScaleMapDrawing | None = None, clip=None, antialias: str = "none") -> Frame:
+               scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None, clip=None,
+               antialias: str = "none") -> Frame:
         """Draw a scene.
 
         Parameters
@@ -128,6 +135,8 @@ class Renderer:
             How surfel hierarchies are drawn.
         scale_map : ScaleMapDrawing, optional
             How scale maps are drawn.
+        points : PointDrawing, optional
+            How point clouds and the points of range images are drawn.
         clip : (4,) or (n, 4) array_like, optional
             Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
             that the inside is seen. What is cut off still throws shadows and is seen in mirrors.
@@ -178,6 +187,9 @@ class Renderer:
         scale_map = DEFAULT_SCALE_MAP if scale_map is None else scale_map
         if not isinstance(scale_map, ScaleMapDrawing):
             raise InputError(f"scale_map: expected a clsurf.ScaleMapDrawing, got {scale_map!r}")
+        points = DEFAULT_POINTS if points is None else points
+        if not isinstance(points, PointDrawing):
+            raise InputError(f"points: expected a clsurf.PointDrawing, got {points!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
@@ -193,24 +205,24 @@ class Renderer:
             if lighting and len(lighting.materials) > 1:
                 channels = list(dict.fromkeys([*channels, "id"]))
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not early
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, view_clip(clip, camera), early,
-                                  at_once, lighting)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, points, view_clip(clip, camera),
+                                  early, at_once, lighting)
             floats = shading_floats(shading, scene.lights, back.color, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             lamps = None if at_once and not covered else self.device.upload(floats)
-            look = Look(shading, lod, patches, slim, surfels, scale_map, lamps, "cost" in channels)
+            look = Look(shading, lod, patches, slim, surfels, scale_map, lamps, "cost" in channels, points)
             if at_once:
                 (surface, matrix), = placed
                 arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
                                        whole, floats, channels)
             else:
-                self._draw(grid, scene, camera, look, floats, lighting if early else None)
+                self._draw(grid, scene, camera, look, floats, lighting if early else None, factor)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), look.lamps,
                                "phong" if early else shading.look, channels)
             if covered:
                 edges, large = mark_edges(self.device, self._scratch, grid, self.device.upload(whole), arrays,
                                           edge_layout(grid.layout, len(lighting.materials)))
-                self._draw(large, scene, camera, replace(look, lod=FACTOR * lod, cost=False), floats, lighting)
+                self._draw(large, scene, camera, replace(look, lod=FACTOR * lod, cost=False), floats, lighting, FACTOR)
                 cover_edges(self.device, large, edges, self.device.upload(floats[8:12]), arrays["color"])
             if mirrored:
                 reflect(self.device, scene, camera, shading, back, origin, floats, lighting, arrays)
@@ -224,12 +236,17 @@ class Renderer:
         finally:
             self.device.profile = own_profile
 
-    def _draw(self, grid: Grid, scene, camera, look: Look, floats, lighting) -> None:
-        """Draw all surfaces of a scene into a grid's planes; light them there where `lighting` says how."""
+    def _draw(self, grid: Grid, scene, camera, look: Look, floats, lighting, factor: int) -> None:
+        """Draw all surfaces of a scene into a grid's planes; light them there where `lighting` says how.
+
+        `factor`: samples of the grid along a side of a pixel.
+        """
         for number, (surface, matrix) in enumerate(scene.placed):
             own = surface_shading(scene, look.shading, number)
             KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
                                     look if own is look.shading else replace(look, shading=own), number)
+        if grid.layout.unlit and look.points.eye_dome is not False:
+            eye_dome(self.device, self._scratch, grid, look.points, camera, factor)
         if lighting is not None:
             light_grid(self.device, self._scratch, grid, scene, camera, look.shading, floats, look.lamps, lighting)
 
@@ -237,18 +254,18 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, clip, early: bool, at_once: bool,
+    def _new_grid(self, placed, size, channels, curved, shading, patches, points, clip, early: bool, at_once: bool,
                   lighting) -> Grid:
         """Return bins that nothing has touched yet; `at_once`: only their places."""
-        colored = shading.model_colors and any(getattr(s, name, None) is not None
-                                               for s, _ in placed for name in OWN_COLORS)
-        colored |= shading.look.startswith("ball")
+        colored = shading.model_colors and any(carries_colors(s) for s, _ in placed)
+        colored |= shading.look.startswith("ball") or points.attribute is not None
+        unlit = any(is_unlit(s, points, shading) for s, _ in placed)
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed) and (lighting is None or lighting.plain)
-        layout = Layout(color=(colored or lit or early) and "color" in channels, id="id" in channels,
+        layout = Layout(color=(colored or lit or early or unlit) and "color" in channels, id="id" in channels,
                         count="count" in channels, level="level" in channels, lit=lit, traced=early,
-                        clip_planes=len(clip), differentials=curved)
+                        clip_planes=len(clip), unlit=unlit and "color" in channels, differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * (not at_once),
@@ -284,6 +301,13 @@ class Renderer:
 
     def __exit__(self, *error):
         self.close()
+
+
+def carries_colors(surface) -> bool:
+    """Return whether a surface or a scan has colours of its own."""
+    if isinstance(surface, RangeScan):
+        return all(image.color is not None for image in surface.images)
+    return any(getattr(surface, name, None) is not None for name in OWN_COLORS)
 
 
 def scene_origin(scene) -> np.ndarray:
@@ -327,13 +351,15 @@ def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 7
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
            patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
-           scale_map: ScaleMapDrawing | None = None, clip=None, antialias: str = "none") -> Frame:
+           scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None, clip=None,
+           antialias: str = "none") -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim, surfels, scale_map, clip, antialias)
+                                                supersampling, patches, slim, surfels, scale_map, points, clip,
+                                                antialias)
 
 
 _shared = threading.local()

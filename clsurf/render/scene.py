@@ -6,16 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
+from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .light import Light
 from .material import Material, checked_materials
 
-DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, PointCloud, RangeScan)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

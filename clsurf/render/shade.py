@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from os import PathLike
 
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from .light import Light as Light
 from .material import LOOKS as MATERIAL_LOOKS
 from .material import check_looks
 from .patch_drawing import PatchDrawing
+from .point_drawing import PointDrawing
 from .scale_map_drawing import ScaleMapDrawing
 from .slim_drawing import SlimDrawing
 from .surfel_drawing import SurfelDrawing
@@ -120,6 +120,7 @@ class Look:
     scale_map: ScaleMapDrawing = field(default_factory=ScaleMapDrawing)
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
+    points: PointDrawing = field(default_factory=PointDrawing)
 
 
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:

@@ -30,6 +30,7 @@ class Layout:
     level: bool = False
     lit: bool = False  # colours of patches are lit at their nodes
     traced: bool = False  # colours are lit before the last stage, where rays decide over the light
+    unlit: bool = False  # some colours are final and take no light
     clip_planes: int = 0
     differentials: tuple[str, ...] = ()  # channels of curvature, in the order of their planes
 
@@ -49,7 +50,8 @@ class Layout:
         if self.differentials:
             out |= field_constants(self.differentials, at)
             at += self.differential_planes
-        return out | {"FIELDS": at, "LIT_COLORS": 2 if self.traced else int(self.lit), "CLIP_PLANES": self.clip_planes}
+        lit = 2 if self.traced else int(self.lit or self.unlit)
+        return out | {"FIELDS": at, "LIT_COLORS": lit, "CLIP_PLANES": self.clip_planes}
 
 
 @dataclass(frozen=True, eq=False)

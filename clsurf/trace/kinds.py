@@ -73,6 +73,11 @@ def register(kind: type):
     return enter
 
 
+def traceable(surface) -> bool:
+    """Return whether rays can meet `surface`: points, which have no extent, cannot be hit."""
+    return any(kind in KINDS for kind in type(surface).__mro__)
+
+
 def items(device: Device, count: int) -> tuple[tuple, tuple, int]:
     """Return global size, local size and rays of a work-item for `count` rays."""
     batch = RAYS_OF_ITEM if device.lanes > 1 else 1
