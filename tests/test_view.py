@@ -444,8 +444,11 @@ def test_sizes_come_with_the_canvas(viewer):
 def test_bytes_of_colours():
     color = np.random.default_rng(0).random((9, 7, 4)).astype(np.float32)
     color[..., 3] = 1
-    color[0, 0, :3] = (0, 1, 2)
+    color[0, 0, :3] = (0, 1, 50)
     assert np.abs(picture.to_bytes(color).astype(int) - to_srgb8(color)).max() <= 1
+    color[..., 3] = 0.5
+    color[..., :3] *= 0.5
+    assert np.abs(picture.to_bytes(color).astype(int) - to_srgb8(color, (1, 1, 1))).max() <= 1
 
 
 def test_nothing_to_see_is_shown(device):
@@ -458,8 +461,7 @@ def test_nothing_to_see_is_shown(device):
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
-    ({"camera": 3}, "camera"), ({"up": (0, 0, 0)}, "up"), ({"size": (0, 3)}, "size"),
-    ({"background": (1, 1, 1, 0.5)}, "background")])
+    ({"camera": 3}, "camera"), ({"up": (0, 0, 0)}, "up"), ({"size": (0, 3)}, "size")])
 def test_wrong_arguments(arguments, says, device):
     with pytest.raises(InputError, match=says):
         clsurf.Viewer(sphere(50), device=device, **arguments)

@@ -45,10 +45,13 @@ def _has(scene: Scene, names) -> bool:
 
 
 def to_bytes(color: NDArray) -> NDArray:
-    """Return (h, w, 4) uint8 sRGB, opaque, of linear colour (h, w, 4) over an opaque background."""
+    """Return (h, w, 4) uint8 sRGB, opaque, of linear premultiplied colour (h, w, 4); white is behind what is not."""
     out = np.empty(color.shape, np.uint8)
-    levels = (color[..., :3] * np.float32(4095) + np.float32(0.5)).astype(np.uint16)
-    out[..., :3] = BYTES.take(levels, mode="clip")
+    rgb = color[..., :3]
+    if color[..., 3].min(initial=1) < 1:
+        rgb = rgb + (1 - color[..., 3:])
+    levels = np.minimum(rgb * np.float32(4095) + np.float32(0.5), np.float32(4095)).astype(np.uint16)
+    out[..., :3] = BYTES[levels]
     out[..., 3] = 255
     return out
 
