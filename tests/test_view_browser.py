@@ -72,7 +72,7 @@ def test_the_bunny_in_a_browser(served, tmp_path):
         spread = normals[shown].astype(int)
         assert (spread.max(axis=1) - spread.min(axis=1)).mean() > 40  # colours, where the surface is grey
         browser.press("s")
-        shot = wait_for(lambda: list(served.folder.glob("*.png")))[0]
+        shot = wait_for(lambda: list(served.folder.glob("clsurf-*.png")))[0]
         pixels = read_image(shot)
         assert pixels.shape[:2] == (600, 800)
         both = np.abs(pixels[:560, :, :3].astype(int) - browser.picture()[:560]).max(axis=2) < 60
