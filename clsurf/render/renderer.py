@@ -1,5 +1,6 @@
 """The renderer: a list of stages from a scene to a frame."""
 
+import os
 import threading
 import weakref
 
@@ -7,29 +8,40 @@ import numpy as np
 
 from ..device import Device, Profile, open_device
 from ..errors import DeviceError, InputError
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .average import average, checked_supersampling, fine_channels
 from .camera import Camera
 from .clip import checked_clip, view_clip
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
+from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
 from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
+from .scale_map import draw_scale_map, upload_scale_map
+from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
+from .surfels import draw_surfels, upload_surfels
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
-KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches)}
+KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
+         SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
+         Mesh: (upload_mesh, draw_mesh)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM = Shading(), PatchDrawing(), SlimDrawing()
+DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP = (
+    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing())
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -70,7 +82,8 @@ class Renderer:
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None, clip=None) -> Frame:
+               slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+               scale_map: ScaleMapDrawing | None = None, clip=None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -83,7 +96,8 @@ class Renderer:
         channels : sequence of str
             Of "color", "depth", "normal", "position", "id", "count", "level", "cost" (see `Frame`); "cost" is the
             number of surfel evaluations per pixel of the pixel's bin of 8x8, or that of tests of a pixel against a
-            cell of a patch. For patches "count" is 1 and "level" the mip level, 0 for the patch's own nodes.
+            cell of a patch or a scale map. For patches "count" is 1 and "level" the mip level, 0 for the patch's own
+            nodes; for scale maps 1 and the layer.
             Curvature of SLIM surfaces (float32, NaN elsewhere), from blended derivatives of the surfels (paper,
             equation 8, left), world units: "mean", "gaussian", "k1" >= "k2" (1/length; positive where the surface
             curves away from the side its stored normals point to, that of the eye where it is not oriented),
@@ -104,6 +118,10 @@ class Renderer:
             How spatial patches are drawn.
         slim : SlimDrawing, optional
             How SLIM surfaces are drawn.
+        surfels : SurfelDrawing, optional
+            How surfel hierarchies are drawn.
+        scale_map : ScaleMapDrawing, optional
+            How scale maps are drawn.
         clip : (4,) or (n, 4) array_like, optional
             Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
             that the inside is seen. What is cut off still throws shadows and is seen in mirrors.
@@ -121,6 +139,8 @@ class Renderer:
         """
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
+        if self.device.process != os.getpid():
+            raise DeviceError("renderer: it was made before this process was forked: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
         factor, clip = checked_supersampling(supersampling), checked_clip(clip)
         picture, size = size, checked_size([n * factor for n in size])
@@ -138,6 +158,12 @@ class Renderer:
         slim = DEFAULT_SLIM if slim is None else slim
         if not isinstance(slim, SlimDrawing):
             raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
+        surfels = DEFAULT_SURFELS if surfels is None else surfels
+        if not isinstance(surfels, SurfelDrawing):
+            raise InputError(f"surfels: expected a clsurf.SurfelDrawing, got {surfels!r}")
+        scale_map = DEFAULT_SCALE_MAP if scale_map is None else scale_map
+        if not isinstance(scale_map, ScaleMapDrawing):
+            raise InputError(f"scale_map: expected a clsurf.ScaleMapDrawing, got {scale_map!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
@@ -160,7 +186,9 @@ class Renderer:
                 lamps = self.device.upload(floats)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, slim, lamps, "cost" in channels), number)
+                                            Look(shading, lod, patches, slim, surfels, scale_map, lamps,
+                                                 "cost" in channels),
+                                            number)
                 if traced:
                     light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
@@ -181,8 +209,8 @@ class Renderer:
 
     def _new_grid(self, placed, size, channels, curved, shading, patches, clip, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
-        colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
-                                               for s, _ in placed)
+        colored = shading.model_colors and any(getattr(s, name, None) is not None
+                                               for s, _ in placed for name in ("colors", "color"))
         colored |= shading.look.startswith("ball")
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
@@ -268,13 +296,14 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, clip=None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+           scale_map: ScaleMapDrawing | None = None, clip=None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim, clip)
+                                                supersampling, patches, slim, surfels, scale_map, clip)
 
 
 _shared = threading.local()
