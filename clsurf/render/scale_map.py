@@ -224,7 +224,8 @@ def draw_scale_map(device: Device, scratch: Scratch, grid: Grid, upload: ScaleMa
     """Run all stages of one placed map: nodes (kept), project, bin, tile."""
     cells = cells_of(device, upload, look.scale_map)
     floats, cull = place_scale_map(upload, matrix, camera, grid.size, look.shading.color)
-    view = device.upload(floats)
+    cull = cull and not grid.layout.clip_planes  # cut open, a closed map shows its inside
+    view = device.upload(grid.clip_into(floats))
     records, footprints = project_cells(device, scratch, cells, view, cull)
     pairs = bin_pairs(device, scratch, grid, footprints, cells.blocks)
     if pairs is not None:

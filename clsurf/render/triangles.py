@@ -115,7 +115,7 @@ def draw_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: Tria
     """
     if not len(triangles.faces):
         return
-    view = device.upload(floats)
+    view = device.upload(grid.clip_into(floats))
     points, pairs = project_triangles(device, scratch, grid, triangles, view)
     if pairs is None:
         return

@@ -8,6 +8,7 @@
 #include "render/cells.clh"
 #include "common/planes.clh"
 #include "common/cube.clh"
+#include "common/clip.clh"
 
 #ifndef TILE_BINS
 #define TILE_BINS 4
@@ -24,6 +25,9 @@
 typedef struct {
   VF z;       // -1 / depth, or depth where the picture is orthographic
   VI seen;    // node A of the cell times 4, 2 for the triangle DCB, 1 where it is seen from behind; -1: nothing
+#if CLIP_PLANES
+  VF low, high;  // what clip planes keep of z
+#endif
 #if !CAST
   VF p, q, r; // edge functions across from the corners A, B, C or D, C, B
 #endif
@@ -41,6 +45,9 @@ INLINE void draw_triangle(__global const float *cells, int cell, int across_p, i
   VF z = EDGE(depth);
   z = lesser(greater(z, (VF)(CELL(low))), (VF)(CELL(low + 1)));
   in = in & (z < at->z) & (z > nearest);
+#if CLIP_PLANES
+  in = in & (z > at->low) & (z < at->high);
+#endif
   at->z = SEL(at->z, z, in);
   at->seen = SEL(at->seen, (VI)(seen), in);
 #if !CAST
@@ -58,6 +65,18 @@ INLINE void draw_cell(__global const float *record, int cell, int node, VF px, V
                   4 * node + 2 + (as_int(record[BACK_2]) >> cell & 1), px, py, nearest, at);
 }
 #include "render/cells_shown.clh"
+
+// Set what clip planes keep of z in the pixels (px, py) of the picture.
+INLINE void clip_pixels(__global const float *view, float unit, VF px, VF py, Pixels *at) {
+#if CLIP_PLANES
+  VF infinite = INFINITY, low = -infinite, high = infinite;
+  clip_range(view, px, py, &low, &high);
+  if (view[PERSPECTIVE] > 0.0f) {
+    at->low = SEL(-infinite, -unit / low, low > 0.0f);
+    at->high = SEL(-infinite, -unit / high, high > 0.0f);
+  } else { at->low = low * (1.0f / unit); at->high = high * (1.0f / unit); }
+#endif
+}
 
 __kernel void tile_cells(__global const float *view, __global const uint2 *pairs, __global const uint *offsets,
                          __global const float *records, __global const float4 *nodes, int side, int grid_nodes,
@@ -92,6 +111,7 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
     Pixels here;
     START(pixel)
     here.z = start; here.seen = -1;
+    clip_pixels(view, unit, px, py, &here);
     for (int e = begin; e < end; e++) {
       __global const float *record = records + (size_t)INDEX_OF(pairs[e]) * CELL_RECORD;
       int base = as_int(record[BASE_NODE]);
@@ -113,6 +133,8 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
       int quarter = b / (16 / VW), qx = (quarter & 1) * 4, qy = (quarter >> 1) * 4 + b % (16 / VW) * (VW / 4);
       START(qy * BIN + qx)
       all[b].z = start; all[b].seen = -1;
+      clip_pixels(view, unit, TO_VF(LANE_INDEX & 3) + (bx + qx - 3.5f), TO_VF(LANE_INDEX >> 2) + (by + qy - 3.5f),
+                  &all[b]);
     }
     for (int e = begin; e < end; e++) {
       uint2 pair = pairs[e];
