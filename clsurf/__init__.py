@@ -20,6 +20,8 @@ from .build.slim import build_slim
 from .device import Device, Profile, open_device
 from .errors import Error
 from .io import load, load_frames, save
+from .io.stored import StoredSurface
+from .io.stored import open_surface as open
 from .render.camera import Camera
 from .render.frame import Frame
 from .render.patch_drawing import PatchDrawing
@@ -39,9 +41,10 @@ from .trace.hits import Hits, trace
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing", "PatchSurface",
-    "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene", "Shading",
-    "SlimDrawing", "SlimSurface", "SurfaceError", "build_patches", "build_slim", "color_map", "curvature", "error",
-    "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load", "load_frames", "models",
-    "open_device", "project", "render", "report", "save", "slim_of_error", "smooth", "sparsity", "trace",
+    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing",
+    "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene",
+    "Shading", "SlimDrawing", "SlimSurface", "StoredSurface", "SurfaceError", "build_patches", "build_slim",
+    "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load",
+    "load_frames", "models", "open", "open_device", "project", "render", "report", "save", "slim_of_error", "smooth",
+    "sparsity", "trace",
 ]

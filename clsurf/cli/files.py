@@ -19,7 +19,9 @@ from .recipe import (
     SpacingOption,
     ViewsOption,
     recipe,
+    with_tolerance,
 )
+from .stream import checked_stream, stream
 
 
 def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
@@ -107,12 +109,23 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
           out: Annotated[Path, typer.Argument(help="The surface to write: .clsurf, or for slim .slim2t.")],
           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
           spacing: SpacingOption = None, nodes: NodesOption = "", method: MethodOption = "", views: ViewsOption = None,
-          precise: PreciseOption = False, device: DeviceOption = "", quiet: QuietOption = False):
+          precise: PreciseOption = False,
+          tolerance: Annotated[float, typer.Option(help="slim: world units; points that the surface does not come so "
+                                                   "near get surfels of their own [off].")] = 0.0,
+          memory: Annotated[str, typer.Option(help="slim: stream a LAS, LAZ, PLY or text scan within this memory, such "
+                                              "as 1GB; stopped builds go on with the same command.")] = "",
+          scheduler: Annotated[str, typer.Option(help="slim: stream the scan on the workers of a Dask scheduler, "
+                                                 "tcp://host:8786 or local; they see the same files.")] = "",
+          device: DeviceOption = "", quiet: QuietOption = False):
     """Turn a scan into a surface: SLIM surfels or spatial patches."""
     import clsurf
     steps = Steps(quiet)
     how = recipe(kind, degree, error, patches=patches, spacing=spacing, nodes=nodes, method=method, views=views,
                  precise=precise)
+    how = with_tolerance(how, tolerance)
+    if memory or scheduler:
+        stream(scan, checked_stream(how, memory, scheduler, out), how, memory, scheduler, device or None, steps)
+        return
     checked_out(out, (".clsurf",) if how.kind == "patches" else (".clsurf", ".slim2t"))
     with steps.step("load"):
         loaded = clsurf.load(scan)

@@ -1,6 +1,6 @@
 """How a scan becomes a surface: the options of `build`, and of `render` and `report` where they are given a scan."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import typer
@@ -70,8 +70,17 @@ def recipe(kind: str = "", degree: int | None = None, error: str = "", **patch_o
         given["error"] = parsed_error(error, "patches" if kind else "")
     checked_request(given.get("nodes", 17), *(given.get(name) for name in ("patches", "spacing", "error", "views")),
                     given.get("precise", False))
-    slim = {"degree": degree or 2, "error": parsed_error(error, "slim") if kind != "patches" and error else 0.01}
+    slim = {"degree": degree or 2, "error": parsed_error(error, "slim") if kind != "patches" and error else None}
     return Recipe(kind, slim, given)
+
+
+def with_tolerance(how: Recipe, tolerance: float) -> Recipe:
+    """Return the recipe of a surface that keeps `tolerance` (world units) where it can; 0: as it was."""
+    if not tolerance:
+        return how
+    if how.kind == "patches":
+        raise InputError("--tolerance: an option of --kind slim, got --kind patches")
+    return replace(how, kind="slim", slim=how.slim | {"tolerance": tolerance})
 
 
 def parsed_error(text: str, kind: str = "slim") -> float | str:
