@@ -23,6 +23,7 @@ from .build.surfels import build_surfels
 from .device import Device, Profile, open_device
 from .errors import Error
 from .io import load, load_frames, save
+from .io.stored import StoredSurface, open_surface
 from .io.video import write_video
 from .render.camera import Camera
 from .render.camera_path import CameraPath, load_cameras, render_frames, save_cameras, turntable
@@ -56,9 +57,9 @@ __all__ = [
     "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Material", "Mesh",
     "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "PointDrawing", "Profile", "Projection", "RangeImage",
     "RangeScan", "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface",
-    "SurfaceError", "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim",
-    "build_surfels", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface",
-    "lines", "load", "load_cameras", "load_frames", "models", "morph", "open_device", "project", "render",
-    "render_frames", "report", "save", "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable",
-    "view", "write_video",
+    "StoredSurface", "SurfaceError", "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map",
+    "build_slim", "build_surfels", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels",
+    "line_surface", "lines", "load", "load_cameras", "load_frames", "models", "morph", "open_device", "open_surface",
+    "project", "render", "render_frames", "report", "save", "save_cameras", "slim_of_error", "smooth", "sparsity",
+    "trace", "turntable", "view", "write_video",
 ]

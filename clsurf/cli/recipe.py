@@ -100,7 +100,7 @@ def recipe(kind: str = "", degree: int | None = None, error: str = "", map_size:
         given["error"] = parsed_error(error, "patches" if kind else "")
     checked_request(given.get("nodes", 17), *(given.get(name) for name in ("patches", "spacing", "error", "views")),
                     given.get("precise", False))
-    slim = {"degree": degree or 2, "error": parsed_error(error, "slim") if kind != "patches" and error else 0.01}
+    slim = {"degree": degree or 2, "error": parsed_error(error, "slim") if kind != "patches" and error else None}
     return Recipe(kind, slim, given)
 
 
@@ -114,6 +114,8 @@ def surfel_recipe(degree, error, of_surfels: dict, others: dict) -> Recipe:
                          "--kind surfels")
     checked_options(spacing, of_surfels.get("map_size", 16), of_surfels.get("hybrid", False))
     return Recipe("surfels", surfels=of_surfels | ({} if spacing is None else {"spacing": spacing}))
+
+
 def with_scale_map(how: Recipe, size: int | None, bits: int | None, layers: int | None, normals: bool, hit: str,
                    center: str) -> Recipe:
     """Return the recipe with the options of scale maps, or raise InputError where it makes something else."""
@@ -138,6 +140,15 @@ def parsed_center(text: str) -> tuple[float, ...]:
     except ValueError:
         raise InputError(f"center: expected three numbers such as 0,1.5,0, or visible, got {text!r}") from None
     return numbers
+
+
+def with_tolerance(how: Recipe, tolerance: float) -> Recipe:
+    """Return the recipe of a surface that keeps `tolerance` (world units) where it can; 0: as it was."""
+    if not tolerance:
+        return how
+    if how.kind not in ("", "slim"):
+        raise InputError(f"--tolerance: an option of --kind slim, got --kind {how.kind}")
+    return replace(how, kind="slim", slim=how.slim | {"tolerance": tolerance})
 
 
 def parsed_error(text: str, kind: str = "slim") -> float | str:
