@@ -126,9 +126,8 @@ def render(source: SourceArgument,
     def drawn(seen):
         if colored:
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
-        frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
-                              written.background, chosen, supersampling=supersampling, patches=drawing,
-                              antialias=written.antialias)
+        frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod, written.background,
+                              chosen, supersampling=supersampling, patches=drawing, antialias=written.antialias)
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)

@@ -7,10 +7,10 @@ Kernel: kernels/render/light_points.cl.
 import numpy as np
 from numpy.typing import NDArray
 
-from ..build.large_faces import longest2
 from ..device import Device, DeviceArray
-from ..surface.srgb import LINEAR_OF_BYTE, to_linear
+from ..surface.srgb import to_linear
 from ..trace.hits import Hits, trace
+from ..trace.kinds import traced
 from .backdrop import Backdrop
 from .light import KINDS, LIGHT_FLOATS
 from .lighting import Lighting, surface_shading
@@ -19,7 +19,7 @@ from .shade import HEAD_FLOATS, Shading
 from .tiles import view_floats
 
 CHANNELS = ("position", "normal", "id")  # that a picture needs for it
-# Where a ray starts, in node spacings of patches, texels or median radii of surfels: up the normal, and along itself.
+# Where a ray starts, in node spacings of patches or median radii of surfels: up the normal, and along itself.
 LIFT, START = 0.05, 0.5
 POINT_FLOATS, SPAN = 16, 64  # kernels/render/light_points.cl
 
@@ -43,20 +43,9 @@ def mirror_shares(scene, shading: Shading) -> NDArray:
                      for own, m in zip(shares, scene.surface_materials, strict=True)])
 
 
-def grain(surface, matrix) -> float:
+def grain(device: Device, surface, matrix) -> float:
     """Return the length (world units) within which a surface's own points are no obstacles to rays from it."""
-    scale = 1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if hasattr(surface, "leaf"):
-        own = surface.radii[surface.leaf] if surface.leaf.any() else surface.radii
-    elif hasattr(surface, "spacing"):
-        own = np.array([surface.spacing])
-    elif hasattr(surface, "faces"):
-        own = np.sqrt(longest2(surface.vertices, surface.faces[::max(1, len(surface.faces) // 20_000)]))
-    elif hasattr(surface, "scales"):
-        return scale * surface.radius * 2 / surface.size
-    else:
-        own = np.linalg.norm(surface.axis_x, axis=1)
-    return scale * float(np.median(own)) if len(own) else 0.0
+    return (1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))) * traced(device, surface).grain
 
 
 def reflect(device: Device, scene, camera, shading: Shading, backdrop: Backdrop, origin: NDArray, floats: NDArray,
@@ -67,7 +56,7 @@ def reflect(device: Device, scene, camera, shading: Shading, backdrop: Backdrop,
     shading buffer.
     """
     number = device.download(arrays["id"])
-    shares, grains = mirror_shares(scene, shading), [grain(*part) for part in scene.placed]
+    shares, grains = mirror_shares(scene, shading), [grain(device, *part) for part in scene.placed]
     use = number >= 0
     use[use] = shares[number[use]] > 0
     if not use.any():
@@ -98,10 +87,10 @@ def lit(device: Device, scene, camera, shading: Shading, hits: Hits, rays: NDArr
     rows = np.zeros((len(points), POINT_FLOATS), np.float32)
     for at, vectors in ((0, points - camera.eye), (3, normals), (6, -rays[hit])):
         rows[:, at:at + 3] = vectors @ camera.rotation.T
-    rows[:, 9:12] = base_colors(scene, shading, surface, hits.primitive[hit])
+    rows[:, 9:12] = base_colors(device, scene, shading, surface, hits.primitive[hit])
     rows[:, 12] = lighting.material_of[surface]
     if shading.shadows:
-        step = np.array([grain(*part) for part in scene.placed])[surface]
+        step = np.array([grain(device, *part) for part in scene.placed])[surface]
         rows[:, 13] = shadow_bits(device, scene, points, normals, step).view(np.float32)
     floats = floats.copy()
     lamps = floats[HEAD_FLOATS:].reshape(-1, LIGHT_FLOATS)
@@ -132,25 +121,13 @@ def shadow_bits(device: Device, scene, points: NDArray, normals: NDArray, step: 
     return bits
 
 
-def base_colors(scene, shading: Shading, surface: NDArray, primitive: NDArray) -> NDArray:
-    """Return the linear colours (n, 3) of what was hit: a surfel's, or the mean of a patch's."""
+def base_colors(device: Device, scene, shading: Shading, surface: NDArray, primitive: NDArray) -> NDArray:
+    """Return the linear colours (n, 3) of what was hit: a surfel's, a face's, or the mean of a patch's."""
     out = np.zeros((len(surface), 3))
     for number, (own, _) in enumerate(scene.placed):
         here, look = surface == number, surface_shading(scene, shading, number)
         out[here] = to_linear(look.color)
-        if not look.model_colors or not here.any():
-            continue
-        colors = getattr(own, "colors", None)
-        if getattr(own, "vertex_colors", None) is not None:
-            out[here] = LINEAR_OF_BYTE[own.vertex_colors[own.triangles[primitive[here]], :3]].mean(axis=1)
-        elif colors is not None and hasattr(own, "faces"):
-            out[here] = LINEAR_OF_BYTE[colors[own.faces[primitive[here]], :3]].mean(axis=1)
-        elif colors is not None and hasattr(own, "radii"):
-            out[here] = LINEAR_OF_BYTE[colors[primitive[here], :3]]
-        elif colors is not None:
-            linear = LINEAR_OF_BYTE[colors[:, :3]]
-            mean = np.add.reduceat(linear, own.node_offset[:-1], axis=0) / np.diff(own.node_offset)[:, None]
-            out[here] = mean[primitive[here]]
-        elif getattr(own, "color", None) is not None:
-            out[here] = LINEAR_OF_BYTE[own.color]
+        colors = traced(device, own).colors
+        if look.model_colors and colors is not None and here.any():
+            out[here] = colors(primitive[here])
     return out

@@ -21,7 +21,7 @@ from .clip import checked_clip, view_clip
 from .coverage import FACTOR, checked_antialias, cover_edges, edge_channels, edge_layout, mark_edges
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
-from .lighting import OWN_COLORS, prepared_lighting, surface_shading, wants_lighting
+from .lighting import prepared_lighting, surface_shading, wants_lighting
 from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
 from .mirror import reflect, wants_mirror
@@ -193,8 +193,8 @@ class Renderer:
             if lighting and len(lighting.materials) > 1:
                 channels = list(dict.fromkeys([*channels, "id"]))
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not early
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, view_clip(clip, camera), early,
-                                  at_once, lighting)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, early, at_once, lighting,
+                                  view_clip(clip, camera))
             floats = shading_floats(shading, scene.lights, back.color, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             lamps = None if at_once and not covered else self.device.upload(floats)
@@ -237,11 +237,11 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, clip, early: bool, at_once: bool,
-                  lighting) -> Grid:
+    def _new_grid(self, placed, size, channels, curved, shading, patches, early: bool, at_once: bool, lighting,
+                  clip) -> Grid:
         """Return bins that nothing has touched yet; `at_once`: only their places."""
         colored = shading.model_colors and any(getattr(s, name, None) is not None
-                                               for s, _ in placed for name in OWN_COLORS)
+                                               for s, _ in placed for name in ("colors", "color"))
         colored |= shading.look.startswith("ball")
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels

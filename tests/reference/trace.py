@@ -57,6 +57,26 @@ def trace_lights(surface, view, lamps, reach, points, normals, eye):
     return out
 
 
+def lamp_rays(pixels, view, place, lamp, bit, step, reach, bins_x, planes, mask):
+    """Return the rays (n, 8) from the points of `pixels` to one lamp, in the frame of `place`."""
+    bins, at = pixels // 64, pixels % 64
+    depth, normal = planes[bins, 0, at].astype(float), planes[bins, 1:4, at].astype(float)
+    x, y = bins % bins_x * 8 + at % 8 + 0.5, bins // bins_x * 8 + at // 8 + 0.5
+    across = depth if view[17] else 1.0
+    points = np.stack([(x - view[15]) / view[13] * across, (view[16] - y) / view[14] * across, -depth], axis=1)
+    points += step * normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    to = np.tile(lamp[1:4].astype(float), (len(pixels), 1)) - (points if lamp[0] == 2 else 0)
+    length = np.linalg.norm(to, axis=1)
+    far = np.minimum(length, reach) if lamp[0] == 2 else np.full(len(pixels), reach)
+    want = ((to * normal).sum(axis=1) > 0) & (mask[bins, at] >> np.uint32(bit) & 1 == 0)
+    linear, zero, unit = place[:12].reshape(3, 4)[:, :3], place[:12].reshape(3, 4)[:, 3], place[12]
+    out = np.zeros((len(pixels), 8))
+    out[:, :3], out[:, 3] = points @ linear.T + zero, step / unit
+    out[:, 4:7] = to @ linear.T * (unit / length)[:, None]
+    out[:, 7] = np.where(want, np.minimum(far, 1e30) / unit, -1)
+    return out
+
+
 def light_bins(view, shading, pixels, depth, gradient, base, shadows, directions=None, hidden=None):
     """Linear colours (p, 3) of hit pixels: what `render.shade` gives, without hidden lamps and ambient light.
 
