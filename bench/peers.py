@@ -42,12 +42,14 @@ class VtkWindow:
     def __init__(self, module, mesh, size):
         self.module = module
         from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-        faces = np.concatenate([np.full((len(mesh.faces), 1), 3), mesh.faces], axis=1).astype(np.int64)
+        # Points alone where there are no faces.
+        faces = getattr(mesh, "faces", np.arange(len(mesh.points))[:, None])
+        cells_of = np.concatenate([np.full((len(faces), 1), faces.shape[1]), faces], axis=1).astype(np.int64)
         points, cells, data = module.vtkPoints(), module.vtkCellArray(), module.vtkPolyData()
-        points.SetData(numpy_to_vtk(np.array(mesh.vertices), deep=True))
-        cells.SetCells(len(mesh.faces), numpy_to_vtkIdTypeArray(faces.ravel(), deep=True))
+        points.SetData(numpy_to_vtk(np.array(mesh.points), deep=True))
+        cells.SetCells(len(faces), numpy_to_vtkIdTypeArray(cells_of.ravel(), deep=True))
         data.SetPoints(points)
-        data.SetPolys(cells)
+        (data.SetPolys if faces.shape[1] == 3 else data.SetVerts)(cells)
         if mesh.normals is not None:
             data.GetPointData().SetNormals(numpy_to_vtk(np.array(mesh.normals), deep=True))
         if mesh.colors is not None:

@@ -9,18 +9,25 @@ import typer
 from ..errors import InputError
 from .common import DeviceOption, QuietOption, Steps, checked_out, is_surface
 from .recipe import (
+    BitsOption,
+    CenterOption,
     DegreeOption,
     ErrorOption,
+    HitOption,
     HybridOption,
     KindOption,
+    LayersOption,
     MapSizeOption,
     MethodOption,
     NodesOption,
+    NormalsOption,
     PatchesOption,
     PreciseOption,
     SpacingOption,
+    TexelsOption,
     ViewsOption,
     recipe,
+    with_scale_map,
 )
 
 
@@ -48,6 +55,8 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
         _about_patches(thing)
     elif isinstance(thing, clsurf.SurfelHierarchy):
         _about_surfels(thing)
+    elif isinstance(thing, clsurf.ScaleMap):
+        _about_scale_map(thing)
     elif hasattr(thing, "images"):
         for i, image in enumerate(thing.images):
             print(f"image {i:<3}{image}")
@@ -115,6 +124,15 @@ def _about_surfels(surface) -> None:
           f"; {covered:.1%} of {len(surface.normal_atlas):,} texels covered, colors "
           f"{'no' if surface.color_atlas is None else 'yes'}")
     print(f"error    bound {_bound(surface)}")
+def _about_scale_map(surface) -> None:
+    center = ", ".join(f"{v:.10g}" for v in surface.center)
+    print(f"texels   6 x {surface.size} x {surface.size}, {surface.bits} bits, layers {surface.layers}, {surface.hit} "
+          f"hits, normals {'no' if surface.normals is None else 'yes'}")
+    print(f"sphere   center [{center}], radius {surface.radius:.8g}")
+    print(f"rays     {surface.hole_share:.2%} of layer 0 without a hit; " +
+          ("with several hits: not known" if math.isnan(surface.multiple_share) else
+           f"{surface.multiple_share:.2%} of the sphere with several hits"))
+    print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")
 
 
 def _bound(surface) -> str:
@@ -128,17 +146,20 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
           spacing: SpacingOption = None, nodes: NodesOption = "", method: MethodOption = "", views: ViewsOption = None,
           precise: PreciseOption = False, map_size: MapSizeOption = None, hybrid: HybridOption = False,
-          device: DeviceOption = "", quiet: QuietOption = False):
-    """Turn a scan into a surface: SLIM surfels, spatial patches, or a hierarchy of surfels with normal maps."""
+          size: TexelsOption = None, bits: BitsOption = None, layers: LayersOption = None,
+          normals: NormalsOption = False, hit: HitOption = "", center: CenterOption = "", device: DeviceOption = "",
+          quiet: QuietOption = False):
+    """Turn a scan into a surface: SLIM surfels, spatial patches, surfels with normal maps, or a spherical scale map."""
     import clsurf
     steps = Steps(quiet)
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing, nodes=nodes, method=method,
                  views=views, precise=precise)
-    checked_out(out, (".clsurf",) if how.kind in ("patches", "surfels") else (".clsurf", ".slim2t"))
+    how = with_scale_map(how, size, bits, layers, normals, hit, center)
+    checked_out(out, (".clsurf", ".slim2t") if how.kind in ("", "slim") else (".clsurf",))
     with steps.step("load"):
         loaded = clsurf.load(scan)
     steps.say(f"  {loaded}")
-    if is_surface(loaded):
+    if is_surface(loaded) and how.kind != "scale_map":
         raise InputError(f"{scan}: expected a scan, got a surface ({type(loaded).__name__})")
     if how.kind_for(loaded) == "patches":
         checked_out(out, (".clsurf",))
@@ -155,7 +176,8 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
 def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")],
             out: Annotated[Path, typer.Argument(help="The file to write; its ending chooses the format. Patches "
                                                 "become their nodes, joined by two triangles a cell where the format "
-                                                "has faces; surfel hierarchies their base surfels, or mesh.")],
+                                                "has faces, scale maps likewise their texels; surfel hierarchies their "
+                                                "base surfels, or mesh.")],
             quiet: QuietOption = False):
     """Write a scan or a surface in another format."""
     import clsurf
@@ -163,6 +185,7 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
     from ..io.dispatch import WRITES
     from ..io.scans import WRITES as SCANS
     from ..surface.patch_mesh import patch_mesh
+    from ..surface.scale_mesh import scale_mesh
     from ..surface.surfel import finest_scan
     steps = Steps(quiet)
     checked_out(out, WRITES)
@@ -171,6 +194,9 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
     steps.say(f"  {thing}")
     if isinstance(thing, clsurf.PatchSurface | clsurf.SurfelHierarchy) and out.suffix.lower() in SCANS:
         thing = patch_mesh(thing) if isinstance(thing, clsurf.PatchSurface) else finest_scan(thing)
+        steps.say(f"  {thing}")
+    if isinstance(thing, clsurf.ScaleMap) and out.suffix.lower() in SCANS:
+        thing = scale_mesh(thing)
         steps.say(f"  {thing}")
     with steps.step("save"):
         clsurf.save(thing, out)

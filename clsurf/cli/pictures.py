@@ -20,7 +20,7 @@ from .common import (
     is_surface,
     parsed_size,
 )
-from .lights import LightOption, MirrorOption, OcclusionOption, ShadowsOption, lighting
+from .lights import LightOption, MaterialOption, MirrorOption, OcclusionOption, ShadowsOption, SkyOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .motion import (
     CameraOption,
@@ -31,6 +31,8 @@ from .motion import (
     TurntableOption,
     motion,
 )
+from .output import AntialiasOption, BackgroundOption, BitsOption, ExposureOption, ToneOption, output
+from .raw_scans import AsOption, AttributeOption, EyeDomeOption, PointSizeOption, point_drawing, wants_scan
 from .recipe import (
     DegreeOption,
     ErrorOption,
@@ -55,8 +57,13 @@ NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, ex
 CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
 AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, up to half "
                                            "their alpha.")]
+FormOption = Annotated[str, typer.Option(help="scale_map: cast (rays of pixels) or geosphere.")]
+FacesOption = Annotated[int, typer.Option(help="scale_map: subdivisions of the geosphere, 0 to 9; 6: 81,920 "
+                                          "triangles.")]
+MapNormalsOption = Annotated[str, typer.Option(help="scale_map: auto, stored, neighbours or gradient.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
-LookOption = Annotated[str, typer.Option(help="phong, flat, reflection (lines); slim: ball_size, ball_level.")]
+LookOption = Annotated[str, typer.Option(help="phong, physical, matcap, normal, flat, reflection (lines); slim: "
+                                              "ball_size, ball_level.")]
 
 
 def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg, .exr.")] = Path("clsurf-demo.png"),
@@ -103,20 +110,25 @@ def render(source: SourceArgument,
            channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id, and "
                                                       "those of --channel; .png and .jpg show "
                                                       "color.")] = "color,depth,normal",
-           shading: LookOption = "phong", light: LightOption = None, shadows: ShadowsOption = False,
-           occlusion: OcclusionOption = 0, mirror: MirrorOption = 0.0, supersampling: SamplesOption = 1,
+           shading: LookOption = "phong", material: MaterialOption = "", light: LightOption = None,
+           sky: SkyOption = "", shadows: ShadowsOption = False, occlusion: OcclusionOption = 0,
+           mirror: MirrorOption = 0.0, background: BackgroundOption = "", supersampling: SamplesOption = 1,
+           antialias: AntialiasOption = "none", tone: ToneOption = "none", exposure: ExposureOption = 0.0,
+           bits: BitsOption = 8,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
            interior: InteriorOption = 16.0, no_maps: NoMapsOption = False,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
-           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
-           spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
-           profile: ProfileOption = False, device: DeviceOption = "", quiet: QuietOption = False):
-    """Draw a surface or a scan into a picture, or into a moving one."""
+           form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
+           drawn_as: AsOption = "surface", point_size: PointSizeOption = "", eye_dome: EyeDomeOption = None,
+           attribute: AttributeOption = "", kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "",
+           patches: PatchesOption = None, spacing: SpacingOption = None, map_size: MapSizeOption = None,
+           hybrid: HybridOption = False, profile: ProfileOption = False, device: DeviceOption = "",
+           quiet: QuietOption = False):
+    """Draw a surface, or a scan or its surface, into a picture, or into a moving one."""
     import clsurf
 
     from ..device import Profile
-    from ..render.average import checked_supersampling
     from ..render.renderer import checked_channels, checked_lod, checked_size
     # Every option is checked before the work.
     seen_from = direction or eye or target or (fov, ortho) != (None, None)
@@ -132,9 +144,13 @@ def render(source: SourceArgument,
     view = checked_view(direction, up, fov, eye, target, ortho)
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
     surfels = clsurf.SurfelDrawing(interior, not no_maps)
-    lit = lighting(shading, light, shadows, occlusion, mirror)
+    lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
-    checked_supersampling(supersampling)
+    scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
+    written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel)
+    if written.background == "sky" and not sky:
+        raise InputError("--background sky: expected --sky beside it")
+    as_it_is, points = wants_scan(drawn_as, lines, channel, kind), point_drawing(point_size, eye_dome, attribute)
     if colored:
         colored.prepared(how, degree)
     chosen = clsurf.open_device(device or None)
@@ -142,13 +158,14 @@ def render(source: SourceArgument,
         thing, coarse = strokes.surfaces(source, how, chosen, steps)
         wanted = strokes.channels(wanted, coarse is thing)
     else:
-        thing = loaded_surface(source, how, chosen, steps)
+        thing = loaded_surface(source, how, chosen, steps, as_it_is)
 
     def drawn(seen):
         if colored:
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
-                              device=chosen, supersampling=supersampling, patches=drawing, surfels=surfels)
+                              written.background, chosen, supersampling=supersampling, patches=drawing,
+                              surfels=surfels, scale_map=scale_map, points=points, antialias=written.antialias)
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
@@ -167,7 +184,7 @@ def render(source: SourceArgument,
         strokes.save(out, frame, None if coarse is thing else coarse, seen, picture_size, chosen, steps)
     elif not moving.moves:
         with steps.step("write"):
-            frame.save(out)
+            written.save(frame, out)
     steps.say(f"{'video' if moving.moves else 'picture'}: {out.resolve()}")
 
 
@@ -196,13 +213,13 @@ def report(source: SourceArgument,
     steps.say(f"page: {out.resolve()}")
 
 
-def loaded_surface(source: Path, how: Recipe, device, steps: Steps):
-    """Return the surface in the file `source`, or the one built from the scan in it."""
+def loaded_surface(source: Path, how: Recipe, device, steps: Steps, as_it_is: bool = False):
+    """Return the surface in the file `source`, or the one built from the scan in it; `as_it_is`: the scan."""
     import clsurf
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if not is_surface(thing):
+    if not as_it_is and not is_surface(thing):
         with steps.step("build"):
             thing = how.build(thing, device, steps)
         steps.say(f"  {thing}")

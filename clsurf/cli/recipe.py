@@ -1,6 +1,7 @@
 """How a scan becomes a surface: the options of `build`, and of `render` and `report` where they are given a scan."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import typer
@@ -8,11 +9,11 @@ import typer
 from ..errors import InputError
 from .common import Steps
 
-KINDS = ("slim", "patches", "surfels")
+KINDS = ("slim", "patches", "surfels", "scale_map")
 
-KindOption = Annotated[str, typer.Option(help="slim, patches or surfels; default: patches for range images or where an "
-                                         "option of patches is given, surfels where one of theirs is, otherwise "
-                                         "slim.")]
+KindOption = Annotated[str, typer.Option(help="slim, patches, surfels or scale_map; default: patches for range images "
+                                         "or where an option of patches is given, surfels where one of theirs is, "
+                                         "otherwise slim.")]
 ErrorOption = Annotated[str, typer.Option(help="slim: T_MDL relative to the bounding box's diagonal [0.01], or 'auto': "
                                           "from the scan's noise. patches: root mean square distance relative to the "
                                           "diagonal.")]
@@ -24,6 +25,13 @@ NodesOption = Annotated[str, typer.Option(help="patches: nodes of one, such as 1
 MethodOption = Annotated[str, typer.Option(help="patches: areas (meshes), local or global_views (clouds), ranges "
                                            "(range images); by default what fits the scan.")]
 ViewsOption = Annotated[int | None, typer.Option(help="patches: number of views of global_views.")]
+TexelsOption = Annotated[int | None, typer.Option(help="scale_map: texels along a cube face [128].")]
+BitsOption = Annotated[int | None, typer.Option(help="scale_map: 8, 16, or 32 for floats [8].")]
+LayersOption = Annotated[int | None, typer.Option(help="scale_map: hits of every ray that are kept [1].")]
+NormalsOption = Annotated[bool, typer.Option("--normals", help="scale_map: store the model's normals.")]
+HitOption = Annotated[str, typer.Option(help="scale_map: outermost or innermost [outermost].")]
+CenterOption = Annotated[str, typer.Option(help="scale_map: x,y,z, or visible: a place that sees most; default: that "
+                                           "of the bounding sphere.")]
 PreciseOption = Annotated[bool, typer.Option(help="patches: 32-bit displacements and RGBA, 8 bytes a node.")]
 MapSizeOption = Annotated[int | None, typer.Option(help="surfels: texels along a side of a normal map, 1 to 64 [16].")]
 HybridOption = Annotated[bool, typer.Option("--hybrid", help="surfels: the mesh's triangles are the finest level.")]
@@ -33,10 +41,11 @@ HybridOption = Annotated[bool, typer.Option("--hybrid", help="surfels: the mesh'
 class Recipe:
     """A kind of surface and the options it is built with, checked."""
 
-    kind: str  # "slim", "patches", "surfels", or "": by the scan
+    kind: str  # one of `KINDS`, or "": by the scan
     slim: dict = field(default_factory=dict)
     patches: dict = field(default_factory=dict)
     surfels: dict = field(default_factory=dict)
+    scale_map: dict = field(default_factory=dict)
 
     def kind_for(self, scan) -> str:
         """Return the kind of surface that `scan` becomes."""
@@ -49,6 +58,8 @@ class Recipe:
             return clsurf.build_patches(scan, **self.patches, device=device, progress=steps.progress)
         if self.kind == "surfels":
             return clsurf.build_surfels(scan, **self.surfels, device=device, progress=steps.progress)
+        if self.kind == "scale_map":
+            return clsurf.build_scale_map(scan, **self.scale_map, device=device, progress=steps.progress)
         return clsurf.build_slim(scan, **self.slim, device=device, progress=steps.progress)
 
 
@@ -72,8 +83,12 @@ def recipe(kind: str = "", degree: int | None = None, error: str = "", map_size:
     if of_surfels:
         name = next(iter(of_surfels)).replace("_", "-")
         raise InputError(f"--{name}: an option of --kind surfels, got --kind {kind}")
-    if kind == "slim" and given:
-        raise InputError(f"--{next(iter(given))}: an option of --kind patches, got --kind slim")
+    if kind in ("slim", "scale_map") and given:
+        raise InputError(f"--{next(iter(given))}: an option of --kind patches, got --kind {kind}")
+    if kind == "scale_map":
+        if degree is not None or error:
+            raise InputError(f"--{'error' if error else 'degree'}: not an option of --kind scale_map")
+        return Recipe(kind)
     if degree is not None and (given or kind == "patches"):
         raise InputError(f"--degree: an option of --kind slim, got --{next(iter(given)) if given else 'kind patches'}")
     kind = kind or ("patches" if given else "")
@@ -99,6 +114,30 @@ def surfel_recipe(degree, error, of_surfels: dict, others: dict) -> Recipe:
                          "--kind surfels")
     checked_options(spacing, of_surfels.get("map_size", 16), of_surfels.get("hybrid", False))
     return Recipe("surfels", surfels=of_surfels | ({} if spacing is None else {"spacing": spacing}))
+def with_scale_map(how: Recipe, size: int | None, bits: int | None, layers: int | None, normals: bool, hit: str,
+                   center: str) -> Recipe:
+    """Return the recipe with the options of scale maps, or raise InputError where it makes something else."""
+    options = {"size": size, "bits": bits, "layers": layers, "normals": normals, "hit": hit, "center": center}
+    options = {name: value for name, value in options.items() if value not in ("", None) and value is not False}
+    if options and how.kind != "scale_map":
+        raise InputError(f"--{next(iter(options))}: an option of --kind scale_map, got --kind {how.kind or 'slim'}")
+    if options.get("center", "visible") != "visible":
+        options["center"] = parsed_center(options["center"])
+    from ..build.scale_map import check_options
+    check_options(**{name: options.get(name, value) for name, value in (("size", 128), ("bits", 8), ("layers", 1),
+                                                                      ("hit", "outermost"))})
+    return replace(how, scale_map=options)
+
+
+def parsed_center(text: str) -> tuple[float, ...]:
+    """Return the three numbers of a text such as 0,1.5,0."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+        if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+            raise ValueError
+    except ValueError:
+        raise InputError(f"center: expected three numbers such as 0,1.5,0, or visible, got {text!r}") from None
+    return numbers
 
 
 def parsed_error(text: str, kind: str = "slim") -> float | str:

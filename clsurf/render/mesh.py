@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from ..device import Device
 from ..surface.mesh import Mesh
 from ..surface.srgb import LINEAR_OF_BYTE
+from .points import space_order
 from .shade import Look
+from .texture import upload_texture
 from .tiles import Grid, Scratch
 from .triangles import Triangles, draw_triangles, place_triangles
-
-MORTON_BITS = 10  # an axis, of the order in which faces are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,42 +37,49 @@ def upload_mesh(device: Device, mesh: Mesh) -> MeshUpload:
                         colors=0 if mesh.colors is None else 16 * v)
     finite = np.isfinite(mesh.vertices).all(axis=1)
     faces = mesh.faces if finite.all() else mesh.faces[finite[mesh.faces].all(axis=1)]
-    points = mesh.vertices[finite].astype(np.float64)
+    faces, order = drawing_order(mesh.vertices, faces)
+    put = lambda rows: device.upload(_fours(rows[order]))  # noqa: E731
+    colors = None if mesh.colors is None else LINEAR_OF_BYTE[mesh.colors[:, :3]]
+    textured = mesh.uv is not None and mesh.texture is not None and mesh.texture.size > 0
+    triangles = Triangles(put(mesh.vertices), device.upload(faces), None if mesh.normals is None else put(mesh.normals),
+                          None if colors is None else put(colors), put(mesh.uv) if textured else None,
+                          upload_texture(device, mesh.texture) if textured else None)
+    points = mesh.vertices[order].astype(np.float64)
     low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
     center = low / 2 + high / 2
-    colors = None if mesh.colors is None else _fours(LINEAR_OF_BYTE[mesh.colors[:, :3]])
-    triangles = Triangles(device.upload(_fours(mesh.vertices)), device.upload(faces[face_order(mesh.vertices, faces)]),
-                          None if mesh.normals is None else device.upload(_fours(mesh.normals)),
-                          None if colors is None else device.upload(colors))
     return MeshUpload(triangles, mesh.origin, center, float(np.linalg.norm(high - center)))
 
 
 def _fours(rows) -> NDArray:
-    """Return rows (n, 3) as (n, 4) float32."""
+    """Return rows (n, 2 or 3) as (n, 4) float32."""
     out = np.zeros((len(rows), 4), np.float32)
-    out[:, :3] = rows
+    out[:, :rows.shape[1]] = rows
     return out
 
 
-def face_order(vertices: NDArray, faces: NDArray) -> NDArray:
-    """Return the order (f,) of faces along the Morton curve of their middles, so that neighbours lie close."""
+def drawing_order(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
+    """Sort faces along the Morton curve of their middles, and vertices by their first use in that order.
+
+    Neighbours in space become neighbours in memory (dragon, the tile stage: 0.6 of the time).
+
+    Returns
+    -------
+    faces : (f, 3) int32
+        In the new numbers of vertices.
+    order : (v,) int64
+        The old numbers of the vertices that are used.
+    """
     if not len(faces):
-        return np.zeros(0, np.int64)
-    middle = vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]
-    low = middle.min(axis=0)
-    extent = max(float((middle.max(axis=0) - low).max()), 1e-30)
-    cell = ((middle - low) * np.float32(((1 << MORTON_BITS) - 1) / extent)).astype(np.uint32)
-    code = np.zeros(len(faces), np.uint32)
-    for axis in range(3):
-        code |= _spread(cell[:, axis]) << np.uint32(axis)
-    return np.argsort(code, kind="stable")
-
-
-def _spread(x: NDArray) -> NDArray:
-    """Return the low 10 bits of x (n,) uint32 with two free bits between each."""
-    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        x = (x | x << np.uint32(shift)) & np.uint32(mask)
-    return x
+        return np.zeros((0, 3), np.int32), np.zeros(0, np.int64)
+    middle = vertices[faces[:, 0]] / 3 + vertices[faces[:, 1]] / 3 + vertices[faces[:, 2]] / 3
+    ends = faces[space_order(middle)].ravel()
+    first = np.full(len(vertices), len(ends), np.int64)
+    first[ends[::-1]] = np.arange(len(ends))[::-1]
+    used = np.flatnonzero(first < len(ends))
+    order = used[np.argsort(first[used])]
+    number = np.empty(len(vertices), np.int32)
+    number[order] = np.arange(len(order), dtype=np.int32)
+    return number[ends].reshape(-1, 3), order
 
 
 def draw_mesh(device: Device, scratch: Scratch, grid: Grid, upload: MeshUpload, matrix, camera, look: Look,

@@ -6,15 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
+from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
-from .shade import Light
+from .light import Light
+from .material import Material, checked_materials
 
-DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, PointCloud, RangeScan)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -27,21 +30,28 @@ class Scene:
         Place a surface with ``surface.moved(matrix)``. The number in the list is the channel "id".
     lights : list of Light, optional
         By default one headlight.
+    materials : Material, or list of Material or None, optional
+        Of all surfaces, or of each; a surface without one looks as the `Shading` of the picture says.
 
     Raises
     ------
     InputError
-        Something that cannot be drawn.
+        Something that cannot be drawn, lights that are none, or another number of materials than of surfaces.
     """
 
     surfaces: tuple
     lights: tuple[Light, ...] = (Light(),)
+    materials: Material | tuple[Material | None, ...] | None = None
 
     def __post_init__(self):
         if not isinstance(self.surfaces, list | tuple):
             raise InputError(f"scene: expected a list of surfaces, got a {type(self.surfaces).__name__}")
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
-        object.__setattr__(self, "lights", tuple(self.lights))
+        object.__setattr__(self, "lights", (self.lights,) if isinstance(self.lights, Light) else tuple(self.lights))
+        wrong = next((light for light in self.lights if not isinstance(light, Light)), None)
+        if wrong is not None:
+            raise InputError(f"scene lights: expected clsurf.Light objects, got {wrong!r}")
+        checked_materials(self.materials, len(self.surfaces))
         for i, surface in enumerate(self.surfaces):
             own = surface.surface if isinstance(surface, Placed) else surface
             if not isinstance(own, DRAWABLE):
@@ -51,6 +61,11 @@ class Scene:
 
     def __repr__(self):
         return f"Scene({len(self.surfaces)} surfaces, {len(self.lights)} lights)"
+
+    @property
+    def surface_materials(self) -> tuple[Material | None, ...]:
+        """The material of each surface, None for the shading's."""
+        return checked_materials(self.materials, len(self.surfaces))
 
     @property
     def placed(self) -> list[tuple[object, NDArray | None]]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..surface.srgb import to_linear
 from .shade import Look
+from .texture import Texture
 from .tiles import BIN, Grid, PairLists, Scratch, bin_pairs, new_footprints, view_floats
 
 RUN = 64  # faces that are culled and sorted together: kernels/render/triangles.clh
@@ -36,12 +37,18 @@ class Triangles:
         Model space, of any length; None: those of the faces.
     colors : (v, 4) float32, optional
         Linear red, green, blue; the fourth number is not read.
+    uv : (v, 4) float32, optional
+        Places in `texture` in the first two numbers, zero at its bottom left.
+    texture : Texture, optional
+        In place of colours.
     """
 
     positions: DeviceArray
     faces: DeviceArray
     normals: DeviceArray | None = None
     colors: DeviceArray | None = None
+    uv: DeviceArray | None = None
+    texture: Texture | None = None
 
 
 def place_triangles(camera, size, matrix: NDArray | None, origin: NDArray, center: NDArray, reach: float,
@@ -76,13 +83,15 @@ def place_triangles(camera, size, matrix: NDArray | None, origin: NDArray, cente
 
 
 def project_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: Triangles,
-                      view: DeviceArray) -> tuple[DeviceArray, PairLists | None]:
+                      view: DeviceArray) -> tuple[DeviceArray, DeviceArray, PairLists | None]:
     """Project vertices and sort runs of faces into tiles.
 
     Returns
     -------
     points : (v, 4) float32
         See kernels/render/triangles.clh.
+    boxes : (runs, 4) int16
+        First and last bin that each run may touch, in x and y.
     pairs : PairLists or None
         The runs that may touch each tile of ``grid.patch_bins`` bins; None where nothing touches the picture.
     """
@@ -98,8 +107,8 @@ def project_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: T
         (runs,), (16,), view, points, triangles.faces, faces, runs, touch.full, touch.core, touch.keys, touch.buckets)
     # In a grid whose bins are the tiles.
     tiles = [-(-n // grid.patch_bins) for n in (grid.bins_x, grid.bins_y)]
-    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN))
-    return points, bin_pairs(device, scratch, coarse, touch, runs)
+    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN), masked=False)
+    return points, touch.core, bin_pairs(device, scratch, coarse, touch, runs)
 
 
 def draw_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: Triangles, floats: NDArray, look: Look,
@@ -108,24 +117,30 @@ def draw_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: Tria
 
     Parameters
     ----------
-    floats : (32,) float32
+    floats : (64,) float32
         View buffer, of `place_triangles`.
     number : int
         The surface's place in the scene, for the channel "id".
     """
     if not len(triangles.faces):
         return
-    view = device.upload(floats)
-    points, pairs = project_triangles(device, scratch, grid, triangles, view)
+    view = device.upload(grid.clip_into(floats))
+    points, boxes, pairs = project_triangles(device, scratch, grid, triangles, view)
     if pairs is None:
         return
-    colors = triangles.colors if grid.layout.color and look.shading.model_colors else None
+    colors = texture = None
+    if grid.layout.color and look.shading.model_colors:
+        texture = triangles.texture if triangles.uv is not None else None
+        colors = triangles.uv if texture is not None else triangles.colors
     constants = grid.layout.constants | {
         "VW": scratch.lanes, "TILE_BINS": grid.patch_bins, "HAS_NORMALS": triangles.normals is not None,
-        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost}
+        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost, "MASKED": int(grid.masked),
+        "TEXTURED": texture is not None}
+    texels = (view, view, 0, view) if texture is None else (texture.texels, texture.levels, len(texture.levels),
+                                                            texture.linear)
     tiles_x, group = -(-grid.bins_x // grid.patch_bins), 64 if scratch.lanes == 1 else 1
     tiles = tiles_x * -(-grid.bins_y // grid.patch_bins)
     device.kernel("render/tile_triangles.cl", constants=constants)(
-        (tiles * group,), (group,), view, pairs.pairs, pairs.offsets, points, triangles.faces, len(triangles.faces),
-        triangles.positions, triangles.normals or view, colors or view, number, tiles_x, tiles, grid.bins_x,
-        grid.bins_y, grid.touched, grid.planes)
+        (tiles * group,), (group,), view, pairs.pairs, pairs.offsets, boxes, points, triangles.faces,
+        len(triangles.faces), triangles.positions, triangles.normals or view, colors or view, *texels, number, tiles_x,
+        tiles, grid.bins_x, grid.bins_y, grid.touched, grid.planes)

@@ -1,6 +1,7 @@
 """Range images as plain data: grids of distances or of points, each from one place, and scans made of them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .arrays import frozen
 from .cloud import PointCloud
+from .placed import Placed, placed
 
 FAR = 100.0  # diagonals: where the sensor of a grid of points without an `eye` is taken to stand
 
@@ -179,7 +181,7 @@ class RangeScan:
     def __len__(self):
         return len(self.images)
 
-    @property
+    @cached_property
     def bounds(self) -> NDArray:
         """Bounding box (2, 3) float64 of all samples, world space; NaN where there is none."""
         boxes = []
@@ -198,6 +200,15 @@ class RangeScan:
         return sum(image.nbytes for image in self.images)
 
     @property
+    def origin(self) -> NDArray:
+        """World position (3,) float64 that the points of `to_points` are relative to: the middle of the box."""
+        return np.zeros(3) if np.isnan(self.bounds).any() else self.bounds.mean(axis=0)
+
+    def moved(self, matrix) -> Placed:
+        """Return this scan placed by the similarity `matrix` (4, 4), the arrays shared."""
+        return placed(self, matrix)
+
+    @property
     def sample_count(self) -> int:
         """Samples of all images."""
         return sum(int(image.valid.sum()) for image in self.images)
@@ -207,8 +218,7 @@ class RangeScan:
 
         Rows of the images come one after the other, images in their order. Colours are there if every image has one.
         """
-        bounds = self.bounds
-        origin = np.zeros(3) if np.isnan(bounds).any() else bounds.mean(axis=0)
+        origin = self.origin
         points, scanners, colors = [], [], []
         for image in self.images:
             valid = image.valid

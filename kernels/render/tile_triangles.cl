@@ -3,10 +3,14 @@
 //
 // VW > 1: one work-item per tile; lanes are faces, or pixels of one face where it is large. VW = 1: one work-group of 64
 // work-items per tile, each a face, then a pixel. Twin: tests/reference/render_triangles.py, tile_triangles.
+#include "render/texture.clh"
 #include "render/triangle_draw.clh"
 
 #ifndef HAS_NORMALS
 #define HAS_NORMALS 0  // 1: normals of vertices, 0: of faces
+#endif
+#ifndef TEXTURED
+#define TEXTURED 0     // 1: `colors` are places in a texture
 #endif
 
 // Interpolated normals that look away from the eye: turned over where the face, which counts as looking to the same side as
@@ -26,7 +30,7 @@ INLINE void face_eye(VF fx, VF fy, VF fz, VF ex, VF ey, VF *nx, VF *ny, VF *nz) 
 // What the winners show at pixels (px, py); `payload` NO_SAMPLE: nothing.
 INLINE Seen resolve(__global const float *view, __global const float4 *points, __global const int *faces,
                     __global const float4 *positions, __global const float4 *normals, __global const float4 *colors,
-                    VU payload, VF px, VF py) {
+                    Texture texture, VU payload, VF px, VF py) {
   Seen out;
   VF zero = 0.0f, one = 1.0f;
   out.depth = EMPTY_DEPTH;
@@ -44,7 +48,7 @@ INLINE Seen resolve(__global const float *view, __global const float4 *points, _
   VF a[4], b[4], c[4], wb, wc;
   GATHERED4(a, points, i) GATHERED4(b, points, j) GATHERED4(c, points, k)
   Corner p = {a[0], a[1], a[2], a[3]}, q = {b[0], b[1], b[2], b[3]}, r = {c[0], c[1], c[2], c[3]};
-  weigh(perspective, px, py, p, q, r, &wb, &wc);
+  weigh(perspective, px, py, p, q, r, 1, &wb, &wc);
   out.depth = SEL(out.depth, MIXED(3), shown);
   VF ex = zero, ey = zero;  // towards the eye, z 1
   if (perspective > 0.0f) { ex = (px - view[CX]) * (-1.0f / view[FX]); ey = (py - view[CY]) * (1.0f / view[FY]); }
@@ -77,7 +81,20 @@ INLINE Seen resolve(__global const float *view, __global const float4 *points, _
 #if FIELD_COLOR >= 0
 #if HAS_COLOR
   GATHERED4(a, colors, i) GATHERED4(b, colors, j) GATHERED4(c, colors, k)
+#if TEXTURED
+  // How far apart, in texels, the places of neighbouring pixels are.
+  VF u = MIXED(0), v = MIXED(1), width = (VF)(texture.levels[0].y), height = (VF)(texture.levels[0].z), far = zero;
+  for (int down = 0; down < 2; down++) {
+    weigh(perspective, px + (float)(1 - down), py + (float)down, p, q, r, 0, &wb, &wc);
+    VF du = (MIXED(0) - u) * width, dv = (MIXED(1) - v) * height;
+    VF d = du * du + dv * dv;
+    far = VMAX(far, d);
+  }
+  far = VMIN(far, (VF)(1e18f));
+  texture_at(texture, u, v, VSQRT(far), &out.red, &out.green, &out.blue);
+#else
   out.red = SEL(zero, MIXED(0), shown); out.green = SEL(zero, MIXED(1), shown); out.blue = SEL(zero, MIXED(2), shown);
+#endif
 #else
   out.red = view[FLAT_COLOR]; out.green = view[FLAT_COLOR + 1]; out.blue = view[FLAT_COLOR + 2];
 #endif
@@ -86,11 +103,14 @@ INLINE Seen resolve(__global const float *view, __global const float4 *points, _
 }
 
 __kernel void tile_triangles(__global const float *view, __global const uint2 *pairs, __global const uint *offsets,
+                             __global const short4 *boxes,
                              __global const float4 *points, __global const int *faces, int count,
                              __global const float4 *positions, __global const float4 *normals,
-                             __global const float4 *colors, int surface, int tiles_x, int tile_count, int bins_x,
+                             __global const float4 *colors, __global const uchar4 *texels,
+                             __global const int4 *levels, int level_count, __global const float *linear, int surface, int tiles_x, int tile_count, int bins_x,
                              int bins_y, __global int *touched, __global float *all_planes) {
   Target to;
+  Texture texture = {texels, levels, level_count, linear};
   to.view = view;
 #if VW == 1
   __local uint slots[TILE * TILE * 2] __attribute__((aligned(16)));
@@ -107,6 +127,14 @@ __kernel void tile_triangles(__global const float *view, __global const uint2 *p
   if (begin == end) return;
   int width = (int)view[WIDTH], height = (int)view[HEIGHT];
   int bin_x = tile % tiles_x * TILE_BINS, bin_y = tile / tiles_x * TILE_BINS;
+#if MASKED
+  int some_wanted = 0;
+  for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
+    int x = bin_x + i % TILE_BINS, y = bin_y + i / TILE_BINS;
+    some_wanted |= x < bins_x && y < bins_y && WANTED(y * bins_x + x);
+  }
+  if (!some_wanted) return;
+#endif
   to.x = bin_x * BIN; to.y = bin_y * BIN;
   to.slots = slots;
   to.cost = cost;
@@ -131,9 +159,15 @@ __kernel void tile_triangles(__global const float *view, __global const uint2 *p
   ulong8 none = NO_SLOT;
   for (int i = 0; i < TILE * TILE / 8; i++) ((ulong8 *)slots)[i] = none;
   for (int i = 0; i < TILE_BINS * TILE_BINS; i++) cost[i] = 0;
+  Hidden hidden;
+  start_hidden(&hidden);
   for (uint e = begin; e < end; e++) {
     uint2 pair = pairs[e];
     int first = (int)INDEX_OF(pair) * RUN, last = first + RUN < count ? first + RUN : count;
+    float near = near_of_key(pair.y);
+    uint key = ordered_one(near);
+    if (view[PERSPECTIVE] > 0.0f) key = near > 0.0f ? ordered_one(-1.0f / near * (1.0f + 1e-6f)) : 0u;
+    if (is_hidden(&hidden, slots, boxes[INDEX_OF(pair)], bin_x, bin_y, key)) continue;
     if (pair.x & RUN_CLIPPED) {
       for (int f = first; f < last; f++)
         draw_clipped(&to, points[faces[3 * f]], points[faces[3 * f + 1]], points[faces[3 * f + 2]], f);
@@ -146,18 +180,20 @@ __kernel void tile_triangles(__global const float *view, __global const uint2 *p
     int x = bin_x + b % TILE_BINS, y = bin_y + b / TILE_BINS;
     if (x >= bins_x || y >= bins_y) continue;
     int bin = y * bins_x + x, was_touched = touched[bin] >= 0;
+    if (!WANTED(bin)) continue;
     __global float *planes = all_planes + (size_t)bin * BIN_PIXELS * FIELDS;
 #if VW == 1
     int px = x * BIN + item % BIN, py = y * BIN + item / BIN;
-    Seen s = resolve(view, points, faces, positions, normals, colors, payload_of(&to, SLOT_OF(px - to.x, py - to.y)),
-                     px + 0.5f, py + 0.5f);
+    Seen s = resolve(view, points, faces, positions, normals, colors, texture,
+                     payload_of(&to, SLOT_OF(px - to.x, py - to.y)), px + 0.5f, py + 0.5f);
     store_seen(planes, was_touched, item, &s, surface);
 #else
     for (int q = 0; q < 64 / VW; q++) {
       int qx = q / (16 / VW) % 2 * 4, qy = q / (32 / VW) * 4 + q % (16 / VW) * (VW / 4);
       int sx = b % TILE_BINS * BIN + qx, sy = b / TILE_BINS * BIN + qy;
       VF px = TO_VF((VI)(to.x + sx) + (LANE_INDEX & 3)) + 0.5f, py = TO_VF((VI)(to.y + sy) + (LANE_INDEX >> 2)) + 0.5f;
-      Seen s = resolve(view, points, faces, positions, normals, colors, payload_of(&to, SLOT_OF(sx, sy)), px, py);
+      Seen s = resolve(view, points, faces, positions, normals, colors, texture,
+                       payload_of(&to, SLOT_OF(sx, sy)), px, py);
       store_seen(planes, was_touched, qy * BIN + qx, &s, surface);
     }
     touched[bin] = (was_touched ? touched[bin] : 0) + cost[b];
@@ -168,7 +204,7 @@ __kernel void tile_triangles(__global const float *view, __global const uint2 *p
   barrier(CLK_GLOBAL_MEM_FENCE);
   for (int b = item; b < TILE_BINS * TILE_BINS; b += GROUP) {
     int x = bin_x + b % TILE_BINS, y = bin_y + b / TILE_BINS, bin = y * bins_x + x;
-    if (x < bins_x && y < bins_y) touched[bin] = (touched[bin] >= 0 ? touched[bin] : 0) + cost[b];
+    if (x < bins_x && y < bins_y && WANTED(bin)) touched[bin] = (touched[bin] >= 0 ? touched[bin] : 0) + cost[b];
   }
 #endif
 }
