@@ -125,8 +125,16 @@ def test_surfel_radii(device):
     indices, _ = nearest(points, 16, device=device)
     radii, spacings = surfel_points.surfel_radii(points, normals, device)
     wanted, wide = twin.surfel_radii(points.astype(np.float64), normals.astype(np.float64), indices, 1.5)
-    np.testing.assert_allclose(radii, wanted, rtol=1e-4)
+    np.testing.assert_allclose(radii, np.minimum(wanted, 2.5 * np.median(wanted[indices[:, 1:]], axis=1)), rtol=1e-4)
     np.testing.assert_allclose(spacings, wide, rtol=1e-4)
+
+
+def test_strays_have_no_large_discs(device):
+    stray = np.array([[9.0, 0, 0], [9.1, 0, 0], [0, -7, 0]], np.float32)
+    points = np.concatenate([sphere(1000).points, stray])
+    normals = np.concatenate([sphere(1000).normals, np.tile([1.0, 0, 0], (3, 1))]).astype(np.float32)
+    radii, _ = surfel_points.surfel_radii(points, normals, device)
+    assert radii[-3:].max() < 0.5 and radii[:-3].max() < 0.3 and np.median(radii) > 0.1
 
 
 @pytest.mark.parametrize("spread", (0.0, 0.35))

@@ -15,8 +15,9 @@ from .slim import usable_points
 
 NEIGHBOURS = 16  # of a point, itself among them (kernels/build/surfel_radii.cl)
 # Radii over the reach of a point's Voronoi cell. At 1.5 a place lies in 3.5 discs on average, and what is seen of them
-# is their inner 3/4, which still leaves no hole (kernels/render/tile_surfels.cl).
+# is their inner 0.85, which still leaves no hole (kernels/render/tile_surfels.cl).
 OVERLAP = 1.5
+STRAY = 2.5  # times the median radius of its neighbours that a radius may have
 FEWEST = 20_000  # points that a mesh of larger faces is sampled at
 MOST = 1 << 26  # base surfels
 
@@ -83,7 +84,17 @@ def surfel_radii(positions: NDArray, normals: NDArray, device: Device) -> tuple[
     if lost.any():
         usual = radii[~lost]
         radii[lost] = np.median(usual) if len(usual) else np.linalg.norm(np.ptp(positions, axis=0)) / 2 or 1.0
-    return radii, spacings
+    return without_strays(radii, indices), spacings
+
+
+def without_strays(radii: NDArray, indices: NDArray) -> NDArray:
+    """Return radii (n,) float32 that exceed those of the neighbours (n, k) little.
+
+    A point far from all others reaches halfway to them: without the limit the lion has discs as large as its head.
+    """
+    near = indices[:, 1:]
+    usual = np.median(np.where(near >= 0, radii[near], radii[:, None]), axis=1)
+    return np.minimum(radii, STRAY * usual).astype(np.float32)
 
 
 def sampled_mesh(mesh: Mesh, spacing) -> Mesh:

@@ -6,8 +6,8 @@
 #ifndef K
 #define K 16
 #endif
-#define RIM 0.6f     // spacings, where no neighbour lies within 60 degrees of a direction: the rim of an open surface
-#define LARGEST 1.5f // spacings
+#define RIM 0.6f      // spacings, where no neighbour lies within 60 degrees of a direction: the rim of an open surface
+#define LARGEST 2.0f  // spacings
 #define LEAST 0.55f
 
 __kernel void surfel_radii(int count, __global const float *points, __global const float *normals,

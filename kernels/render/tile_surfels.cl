@@ -37,7 +37,7 @@
 // The pairs of one block, a segment of the bin's list at a time: what remains has no unpredictable branch.
 #define PAIRS const uint2 *
 #define SKIP(pair, bits)
-#define SEGMENT 64
+#define SEGMENT 256
 INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *kept) {
   int n = 0;
   for (int e = 0; e < count; e++) {
@@ -215,9 +215,9 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
             largest, &best, &first, &facing, &nearest, &cost);
 #else
   uint2 kept[SEGMENT];
-  int more = 1;
+  int more = 1, n = 0;
   for (int from = 0; from < count && more; from += SEGMENT) {
-    int n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
+    n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
     more = frontmost(kept, n, 0u, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest, largest,
                      &best, &first, &facing, &nearest, &cost);
   }
@@ -232,7 +232,7 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
 #else
   more = 1;
   for (int from = 0; from < count && more; from += SEGMENT) {
-    int n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
+    if (count > SEGMENT) n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
     more = blend(kept, n, 0u, deepest, records, atlas, color_atlas, colors, px, py, hit, facing, &sum, &cost);
   }
 #endif

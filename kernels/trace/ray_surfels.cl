@@ -8,7 +8,7 @@
 enum { D_X, D_Y, D_Z, D_NX, D_NY, D_NZ, D_RADIUS, FIELDS };
 #define FIELD(plane) PART(k, (plane) * WIDE)
 // kernels/common/surfel.clh, kernels/render/project_surfels.cl, clsurf/render/surfels.py
-#define CORE 0.75f
+#define CORE 0.85f
 #define BACK 0.25f
 #define SLAB 0.3f
 #define LEAN 0.25f

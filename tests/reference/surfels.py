@@ -6,7 +6,7 @@ from clsurf.surface.slim import frame_of_normals
 from clsurf.surface.surfel import decoded_normals
 
 FALL, FACING = 4.0, 1e-3  # kernels/build/normal_maps.cl
-SLAB, LEAN, EDGE, BACK, CORE = 0.3, 0.25, 0.02, 0.25, 0.75  # clsurf/render/surfels.py, kernels/render/*surfels.cl
+SLAB, LEAN, EDGE, BACK, CORE = 0.3, 0.25, 0.02, 0.25, 0.85  # clsurf/render/surfels.py, kernels/render/*surfels.cl
 RIM_SPREAD, RIM_LEAST, RIM_COSINE, RELIEF = 1.75, 0.1, 0.4, 1.0
 
 
@@ -31,7 +31,7 @@ def surfel_radii(positions, normals, neighbours, overlap):
             along = flat @ direction
             nearest = (0.5 * d2[along > 0] / along[along > 0]).min(initial=np.inf)
             rim = not (along > 0.5 * np.sqrt(d2)).any()
-            most = (0.6 if rim else 1.5) * spacing
+            most = (0.6 if rim else 2.0) * spacing
             reach = max(reach, min(nearest, most))
         radii[i], spacings[i] = overlap * reach, spacing
     return radii, spacings
