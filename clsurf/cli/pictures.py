@@ -163,14 +163,9 @@ def render(source: SourceArgument,
     def drawn(seen):
         if colored:
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
-<<<<<<< HEAD
         frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
                               written.background, chosen, supersampling=supersampling, patches=drawing,
                               surfels=surfels, scale_map=scale_map, points=points, antialias=written.antialias)
-=======
-        frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod, written.background,
-                              chosen, supersampling=supersampling, patches=drawing, antialias=written.antialias)
->>>>>>> light
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)

@@ -140,12 +140,6 @@ def base_colors(device: Device, scene, shading: Shading, surface: NDArray, primi
     for number, (own, _) in enumerate(scene.placed):
         here, look = surface == number, surface_shading(scene, shading, number)
         out[here] = to_linear(look.color)
-<<<<<<< HEAD
         if look.model_colors and here.any() and traced(device, own).colors is not None:
             out[here] = traced(device, own).colors(primitive[here])
-=======
-        colors = traced(device, own).colors
-        if look.model_colors and colors is not None and here.any():
-            out[here] = colors(primitive[here])
->>>>>>> light
     return out

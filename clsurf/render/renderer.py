@@ -24,11 +24,7 @@ from .coverage import FACTOR, checked_antialias, cover_edges, edge_channels, edg
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .eye_dome import eye_dome
 from .frame import Frame
-<<<<<<< HEAD
 from .lighting import OWN_COLORS, prepared_lighting, surface_shading, wants_lighting
-=======
-from .lighting import prepared_lighting, surface_shading, wants_lighting
->>>>>>> light
 from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
 from .mirror import reflect, wants_mirror
@@ -209,13 +205,8 @@ class Renderer:
             if lighting and len(lighting.materials) > 1:
                 channels = list(dict.fromkeys([*channels, "id"]))
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not early
-<<<<<<< HEAD
             grid = self._new_grid(placed, size, channels, curved, shading, patches, points, view_clip(clip, camera),
                                   early, at_once, lighting)
-=======
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, early, at_once, lighting,
-                                  view_clip(clip, camera))
->>>>>>> light
             floats = shading_floats(shading, scene.lights, back.color, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             lamps = None if at_once and not covered else self.device.upload(floats)
@@ -263,21 +254,12 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-<<<<<<< HEAD
     def _new_grid(self, placed, size, channels, curved, shading, patches, points, clip, early: bool, at_once: bool,
                   lighting) -> Grid:
         """Return bins that nothing has touched yet; `at_once`: only their places."""
         colored = shading.model_colors and any(carries_colors(s) for s, _ in placed)
         colored |= shading.look.startswith("ball") or points.attribute is not None
         unlit = any(is_unlit(s, points, shading) for s, _ in placed)
-=======
-    def _new_grid(self, placed, size, channels, curved, shading, patches, early: bool, at_once: bool, lighting,
-                  clip) -> Grid:
-        """Return bins that nothing has touched yet; `at_once`: only their places."""
-        colored = shading.model_colors and any(getattr(s, name, None) is not None
-                                               for s, _ in placed for name in ("colors", "color"))
-        colored |= shading.look.startswith("ball")
->>>>>>> light
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed) and (lighting is None or lighting.plain)
