@@ -1,6 +1,6 @@
 """Benchmarks: each job checks its answer, then prints figures with the device, driver, commit and scene beside them.
 
-`clsurf bench build|tiles|normals|scans|patches [--json FILE]`, `clsurf bench compare A B`;
+`clsurf bench build|tiles|normals|scans|patches|surfels|scale_map [--json FILE]`, `clsurf bench compare A B`;
 `python -m bench.report FILE` runs all.
 """
 
@@ -10,16 +10,19 @@ JOBS = {
     "build": "scan to SLIM surface: time, size, error, overlap, memory",
     "tiles": "frames: time, time per stage and tile, holes, silhouettes, depth and normals against ray casting",
     "channels": "channels of curvature: errors on a torus, cost on a frame",
+    "light": "materials, skies and anti-aliasing: energy, edges, cost on a frame",
     "lines": "feature lines: distance from analytic curves, frames with lines over them",
     "trace": "rays a second: primary, shadows, ambient occlusion, arbitrary ones, beside Embree",
     "sparsity": "surfels and floats by degree for one error, linear splats beside quadratic surfels",
     "normals": "neighbours, normals and their orientation",
     "curvature": "curvature at points: error and time on tori, MeshLab's filters",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
+    "surfels": "surfel hierarchies: normal maps against float64, builds, normals by map size, frames beside SLIM",
     "scans": "meshes and clouds drawn as they are: errors against ray casting, frames, VTK",
     "fuzz": "damaged files of every format: crashes, hangs, memory",
     "devices": "one answer everywhere: hashes of all devices' answers and how far they are apart",
     "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",
+    "scale_map": "spherical scale maps: closed forms and orders, builds, frames, geospheres, morphs",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 

@@ -1,6 +1,7 @@
 """A headless Chromium, steered over its debugging connection."""
 
 import base64
+import contextlib
 import io
 import itertools
 import json
@@ -37,7 +38,8 @@ class Browser:
         port = told.read_text().split("\n")[0]
         pages = json.load(urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=30))
         page = next(page for page in pages if page["type"] == "page")
-        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None)
+        self.open_things = contextlib.ExitStack()
+        self.socket = self.open_things.enter_context(connect(page["webSocketDebuggerUrl"], max_size=None))
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def call(self, method: str, **parameters):
@@ -86,7 +88,7 @@ class Browser:
             self.call("Browser.close")
         except Exception:
             self.process.kill()
-        self.socket.close()
+        self.open_things.close()
         self.process.wait(timeout=30)
 
 

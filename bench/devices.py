@@ -1,8 +1,8 @@
 """The job `devices`: whether every OpenCL device of this machine gives the same answers.
 
 The surfaces are made once, on the first device; then each device runs the jobs of `answers` in a process of its own,
-twice, and its arrays are held against those of the first: equal bytes, or how far apart. Depth must agree within 1e-5 of
-the scene's diagonal at 99.99 % of the pixels, numbers of surfaces and primitives at 99.9 %.
+twice, and its arrays are held against those of the first: equal bytes, or how far apart. Depth must agree within 1e-5
+of the scene's diagonal at 99.99 % of the pixels, numbers of surfaces and primitives at 99.9 %.
 """
 
 import os

@@ -26,7 +26,8 @@ SECONDS = 5.0
 MEMORY_BYTES = 1 << 30
 INPUTS, QUICK_INPUTS = 10_000, 60  # of each format
 SEED = 1
-HUGE = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8, b"\x00\x00\x00\x00", b"\x01\x00\x00\x00")
+HUGE = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8, b"\x00\x00\x00\x00",
+        b"\x01\x00\x00\x00")
 WORDS = (b"99999999999", b"-1", b"1e999", b"nan", b"0", b"2147483648", b"\n", b" ", b"\x00")
 READER = """
 import resource, sys, time, warnings
@@ -61,10 +62,10 @@ def seeds(folder: Path) -> dict[str, Path]:
         clsurf.save(mesh if ending in (".obj", ".stl", ".off", ".glb") else cloud, path)
         found[ending] = path
     ascii_ply = folder / "ascii.ply"
-    ascii_ply.write_text("ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-                         "property uchar red\nproperty uchar green\nproperty uchar blue\nelement face 2\n"
-                         "property list uchar int vertex_indices\nend_header\n0 0 0 255 0 0\n1 0 0 0 255 0\n0 1 0 0 0 9\n"
-                         "0 0 1 1 2 3\n3 0 1 2\n3 0 2 3\n")
+    ascii_ply.write_text("ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+                         "property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
+                         "element face 2\nproperty list uchar int vertex_indices\nend_header\n0 0 0 255 0 0\n"
+                         "1 0 0 0 255 0\n0 1 0 0 0 9\n0 0 1 1 2 3\n3 0 1 2\n3 0 2 3\n")
     found["ascii .ply"] = ascii_ply
     plain = Mesh(mesh.vertices[:24], np.arange(24, dtype=np.int32).reshape(-1, 3))
     clsurf.save(plain, folder / "mesh.ply")
@@ -238,6 +239,6 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
     wrong = [row for row in rows if row["failed"]]
     if wrong:
         raise WrongAnswer(f"bench fuzz: {', '.join(row['format'] for row in wrong)}: "
-                          f"{sum(row['failed'] for row in wrong)} damaged files failed, first: {wrong[0]['first_failure']}"
-                          ": CLSURF_FUZZ names a folder that keeps them")
+                          f"{sum(row['failed'] for row in wrong)} damaged files failed, first: "
+                          f"{wrong[0]['first_failure']}: CLSURF_FUZZ names a folder that keeps them")
     return {"inputs": count, "formats": rows}

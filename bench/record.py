@@ -44,17 +44,19 @@ def commit() -> str:
 
 
 def processor() -> str:
-    """Return the processor's name and the number of cores this process may use."""
-    name = platform.processor() or platform.machine()
+    """Return the processor's name, its widest vector instructions, and the number of cores this process may use."""
+    name, vectors = platform.processor() or platform.machine(), ""
     try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
+        for line in Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines():
             if line.startswith("model name"):
                 name = line.partition(":")[2].strip()
-                break
+            if line.startswith("flags"):  # names alone do not tell processors apart: "AMD EPYC" is any of five
+                flags = line.split()
+                vectors = next((f" with {isa}" for isa in ("avx512f", "avx2", "avx") if isa in flags), "")
     except OSError:
         pass
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{name}, {cores} cores"
+    return f"{name}{vectors}, {cores} cores"
 
 
 def provenance(device) -> dict:

@@ -13,6 +13,7 @@ from .analysis.line_surface import line_surface
 from .analysis.lines import line_channels, lines
 from .analysis.smooth import smooth
 from .analysis.sparsity import slim_of_error, sparsity
+from .build.morph import morph
 from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
@@ -22,16 +23,19 @@ from .build.surfels import build_surfels
 from .device import Device, Profile, open_device
 from .errors import Error
 from .io import load, load_frames, save
+from .io.stored import StoredSurface, open_surface
 from .io.video import write_video
 from .render.camera import Camera
 from .render.camera_path import CameraPath, load_cameras, render_frames, save_cameras, turntable
 from .render.frame import Frame
+from .render.light import Light
+from .render.material import Material
 from .render.patch_drawing import PatchDrawing
 from .render.point_drawing import PointDrawing
 from .render.renderer import Renderer, render
 from .render.scale_map_drawing import ScaleMapDrawing
 from .render.scene import Scene
-from .render.shade import Light, Shading
+from .render.shade import Shading
 from .render.slim_drawing import SlimDrawing
 from .render.surfel_drawing import SurfelDrawing
 from .report.page import report
@@ -50,12 +54,12 @@ from .view.viewer import Viewer
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh",
+    "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Material", "Mesh",
     "PatchDrawing", "PatchSurface", "Placed", "PointCloud", "PointDrawing", "Profile", "Projection", "RangeImage",
     "RangeScan", "Renderer", "ScaleMap", "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface",
-    "SurfaceError", "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim",
-    "build_surfels", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels",
-    "line_surface", "lines", "load", "load_cameras", "load_frames", "models", "open_device", "project", "render",
-    "render_frames", "report", "save", "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable",
-    "view", "write_video",
+    "StoredSurface", "SurfaceError", "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map",
+    "build_slim", "build_surfels", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels",
+    "line_surface", "lines", "load", "load_cameras", "load_frames", "models", "morph", "open_device", "open_surface",
+    "project", "render", "render_frames", "report", "save", "save_cameras", "slim_of_error", "smooth", "sparsity",
+    "trace", "turntable", "view", "write_video",
 ]

@@ -6,9 +6,8 @@ import trimesh
 
 from clsurf import models
 from clsurf.analysis.error import SurfaceError, error, surface_samples
-
 from clsurf.build.patches import build_patches
-from clsurf.build.triangles import nearest_triangles, triangle_distances
+from clsurf.build.triangles import triangle_distances
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh

@@ -173,16 +173,24 @@ def test_radius_leaves_out_what_lies_outside(device):
 
 
 def test_visible_finds_a_centre_that_sees_more(device, caplog):
-    """A sphere with a bump on a thin neck: from the middle of the box much is hidden."""
-    scene = Mesh(np.concatenate([box_mesh((-1, -1, -1), (1, 1, 1)).vertices,
-                                 box_mesh((2, 2, -1), (2.5, 2.5, 1)).vertices]),
-                 np.concatenate([box_mesh().faces, box_mesh().faces + 8]))
+    """A box beside a smaller one: from the middle between them much is hidden."""
+    boxes = box_mesh(), box_mesh((4, 0, -1), (5, 1, 1))
+    scene = Mesh(np.concatenate([box.vertices + box.origin for box in boxes]),
+                 np.concatenate([boxes[0].faces, boxes[1].faces + 8]))
     with caplog.at_level(logging.WARNING, "clsurf"):
         default = clsurf.build_scale_map(scene, 24, device=device)
         assert "more than once" in caplog.text
     seen = clsurf.build_scale_map(scene, 24, center="visible", device=device)
-    once = lambda s: 1 - s.multiple_share - s.hole_share  # noqa: E731
-    assert once(seen) > once(default) + 0.05
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (3000, 3))
+    points[np.arange(3000), rng.integers(0, 3, 3000)] = rng.choice([-1, 1], 3000)  # on the larger box
+
+    def held(surface):
+        apart = points - surface.center
+        there = twin.filtered(surface, apart) * surface.radius
+        return np.mean(np.abs(there - np.linalg.norm(apart, axis=1)) < 0.1)
+
+    assert held(seen) > held(default) + 0.1 and held(seen) > 0.85
 
 
 def test_bounding_sphere():

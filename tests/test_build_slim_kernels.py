@@ -5,7 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from clsurf.build import point_tree, project, radius, slim
+from clsurf.build import point_tree, project, radius
+from clsurf.build import slim_levels as slim
+from clsurf.build.slim import build_slim
 from clsurf.surface.cloud import PointCloud
 from tests.reference import build as twin
 
@@ -132,7 +134,7 @@ def fitted(tree, degree, centers, r_r, penalty=1e-9, mode=slim.SEGMENT):
     out = device.empty((len(centers), slim.RECORD), np.float32)
     kernel = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree})
     kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, LAMBDA, penalty, 0.02, need,
-           mode, *tree.arguments, out)
+           mode, np.inf, *tree.arguments, out)
     return device.download(out), need
 
 
@@ -224,7 +226,7 @@ def test_cover_points(tree, sorted_points):
     record[::5, 1:4] *= -1  # leaves that face away represent only their own centre
     overlap, held = device.zeros(tree.padded, np.uint32), device.zeros(tree.padded, np.uint8)
     device.kernel("build/cover_points.cl")((len(centers),), (1,), len(centers), device.upload(centers, np.int32),
-                                           device.upload(record), *tree.arguments, overlap, held)
+                                           device.upload(record), np.inf, 6, *tree.arguments, overlap, held)
     expected, expected_held = twin.cover_points(points, normals, centers, record)
     got = device.download(overlap)[:tree.count] / slim.OVERLAP_ONE
     assert (np.abs(got - expected) < 3e-4).all()
@@ -273,7 +275,7 @@ def test_surfel_colors(tree, sorted_points):
 @pytest.mark.parametrize("degree", (1, 2, 3))
 def test_project_points(device, degree):
     points, normals = wavy_sheet(3000)
-    surface = slim.build_slim(PointCloud(points, normals=normals), degree=degree, error=0.02, device=device)
+    surface = build_slim(PointCloud(points, normals=normals), degree=degree, error=0.02, device=device)
     queries = points[::30].astype(float) + np.random.default_rng(0).normal(scale=0.01, size=(100, 3))
     near = project.project(surface, queries, device=device)
     expected = [twin.project_points(surface, p) for p in queries]

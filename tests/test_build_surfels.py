@@ -203,7 +203,8 @@ def test_normal_maps_of_a_sphere_are_its_normals(device):
         inside = (got[:, 3] > 0) & ((flat**2).sum(axis=1) < 0.8)
         high = np.sqrt(1 - (flat**2).sum(axis=1, where=inside[:, None], initial=0))
         exact = flat + high[:, None] * n
-        assert np.sqrt((twin.angles(got[inside], exact[inside]) ** 2).mean()) < 0.6  # the points stand 0.6 degrees apart
+        # The points stand 0.6 degrees apart.
+        assert np.sqrt((twin.angles(got[inside], exact[inside]) ** 2).mean()) < 0.6
 
 
 def test_kernel_forms_give_the_same_maps(form, device):
@@ -299,7 +300,7 @@ def test_what_cannot_be_built_is_refused(device):
         build_surfels([1], device=device)
     with pytest.raises(DeviceMemoryError, match="memory_limit"):
         build_surfels(sphere(1000), memory_limit="100kB", device=device)
-    with pytest.raises(InputError, match="spacing: expected with hybrid"):
+    with pytest.raises(InputError, match="spacing: expected without hybrid"):
         build_surfels(uv_sphere(6, 6), hybrid=True, spacing=1.0, device=device)
     flat = Mesh(np.zeros((3, 3), np.float32), [[0, 1, 2]])
     with pytest.raises(InputError, match="face with an area"):

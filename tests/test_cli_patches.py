@@ -91,7 +91,7 @@ def test_drawing_options_reach_the_renderer(folder, capsys):
     (["build", "cloud.ply", "x.clsurf", "--patches", "9", "--error", "auto"], "between 0 and 1"),
     (["build", "cloud.ply", "x.clsurf", "--patches", "9", "--degree", "2"], "--degree: an option of --kind slim"),
     (["build", "cloud.ply", "x.clsurf", "--kind", "slim", "--precise"], "--precise: an option of --kind patches"),
-    (["build", "cloud.ply", "x.clsurf", "--kind", "surfels"], "slim or patches"),
+    (["build", "cloud.ply", "x.clsurf", "--kind", "voxels"], "slim, patches or surfels"),
     (["build", "cloud.ply", "x.clsurf", "--nodes", "1"], "from 2 to 256"),
     (["build", "cloud.ply", "x.clsurf", "--nodes", "17x"], "17x9"),
     (["build", "cloud.ply", "x.clsurf", "--nodes", "many"], "17x9"),

@@ -137,7 +137,7 @@ def test_a_cache_that_cannot_be_written(tmp_path):
 @pytest.mark.parametrize("code, kind", [(cl.status_code.OUT_OF_RESOURCES, DeviceMemoryError),
                                         (cl.status_code.DEVICE_NOT_AVAILABLE, DeviceError)])
 def test_a_device_that_fails_in_the_middle(slim, monkeypatch, code, kind):
-    """A launch that fails is one of clsurf's errors; the next call works, on a new context where the device was lost."""
+    """A launch that fails is one of clsurf's errors; the next call works, on a new context if the device was lost."""
     selector = os.environ.get("CLSURF_DEVICE") or "pocl"
     device = open_device(selector)
     wanted = picture(slim, device)

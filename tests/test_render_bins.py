@@ -63,7 +63,7 @@ def test_count_bins(device, made, parts):
     order, on_device, depth_offsets = ordered(device, made)
     counts = device.empty((parts, BINS[0] * BINS[1]), np.uint32)
     device.kernel("render/count_bins.cl")((parts,), None, on_device, depth_offsets, device.upload(made[0]), parts,
-                                          BINS[0], BINS[0] * BINS[1], counts)
+                                          BINS[0], BINS[0] * BINS[1], counts, counts)
     assert (device.download(counts) == twin.count_bins(order, made[0], parts, BINS[0], BINS[0] * BINS[1])).all()
 
 
@@ -76,7 +76,7 @@ def test_fill_bins(device, made, parts):
     device.write(counts, places)
     device.kernel("render/fill_bins.cl")(
         (parts,), None, on_device, depth_offsets, device.upload(full), device.upload(core), device.upload(keys), parts,
-        BINS[0], BINS[0] * BINS[1], counts, device.upload(twin.scan_totals(totals).astype(np.uint32)), pairs)
+        BINS[0], BINS[0] * BINS[1], counts, counts, device.upload(twin.scan_totals(totals).astype(np.uint32)), pairs)
     assert (device.download(pairs) == twin.fill_bins(order, full, core, keys, BINS[0], BINS[0] * BINS[1])).all()
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from reference.scale_map import icosphere, smooth_map
 from reference.surfaces import leaves, sphere
 from test_render_patches import globe
 
@@ -97,6 +98,27 @@ def test_a_plane_across_the_view_is_a_near_plane(form, cells, renderers):
     same = np.isclose(near.depth, cut.depth, atol=1e-5, equal_nan=True)
     assert same.mean() > (0.95 if cells in ("bilinear", "smooth") else 0.995)
     np.testing.assert_allclose(near.color[same], cut.color[same], atol=5e-3)
+
+
+def others(device):
+    """Meshes of small and of large faces, a scale map cast and as a geosphere, surfels; the tolerances of depth."""
+    if "others" not in _kept:
+        fine, coarse = (clsurf.Mesh(*icosphere(level)) for level in (5, 3))
+        _kept["others"] = {"mesh": (fine, 2e-3, {}), "large faces": (coarse, 0.03, {}),
+                           "scale map": (smooth_map(32), 1e-3, {}),
+                           "geosphere": (smooth_map(32), 0.02,
+                                         {"scale_map": clsurf.ScaleMapDrawing("geosphere")}),
+                           "surfels": (clsurf.build_surfels(clsurf.models.sphere(8000), device=device), 0.03, {})}
+    return _kept["others"]
+
+
+@pytest.mark.parametrize("form", [0, 1], ids=["lanes", "items"])
+@pytest.mark.parametrize("kind", ["mesh", "large faces", "scale map", "geosphere", "surfels"])
+@pytest.mark.parametrize(("camera", "planes"), [("perspective", "oblique"), ("perspective", "facing"),
+                                                ("orthographic", "oblique"), ("near", "along")])
+def test_other_kinds_show_their_inside(form, kind, camera, planes, renderers):
+    surface, tolerance, options = others(renderers[0].device)[kind]
+    check(renderers[form], surface, CAMERAS[camera], PLANES[planes], tolerance, 0.15, **options)
 
 
 @pytest.mark.parametrize("form", [0, 1], ids=["lanes", "items"])

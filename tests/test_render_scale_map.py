@@ -10,7 +10,9 @@ import clsurf
 from clsurf import Camera, ScaleMapDrawing, Scene
 from clsurf.errors import InputError
 from clsurf.render.renderer import Renderer
+from clsurf.render.scale_map import cells_of, upload_scale_map
 from clsurf.surface.cube import texel_directions
+from clsurf.surface.geosphere import geosphere_directions
 from clsurf.surface.scale_map import ScaleMap, encoded_normals
 
 SIZE = (96, 72)
@@ -160,6 +162,25 @@ def test_near_plane_opens_the_surface_and_shows_its_inside(renderers, drawing):
 
 
 @pytest.mark.parametrize("drawing", (CAST, SPHERE))
+@pytest.mark.parametrize("camera", cameras())
+def test_clip_planes_cut_the_surface(renderers, drawing, camera):
+    """What is left lies on the sphere and on the kept side; where the front is cut away the inside is seen."""
+    surface = twin.smooth_map(32)
+    ahead = camera.rotation[2]
+    for renderer in renderers:
+        for plane in ((*ahead, 0.2), (*-ahead, 0.2), (1, 0, 0, -0.1)):
+            frame = renderer.render(surface, camera, SIZE, ("depth", "position"), scale_map=drawing, clip=plane)
+            hit, points = points_of(frame)
+            assert hit.sum() > 300 and (points @ plane[:3] + plane[3]).min() > -1e-3
+            assert np.quantile(np.abs(np.linalg.norm(points, axis=1) - 1), 0.99) < 0.01
+            whole = np.isfinite(renderer.render(surface, camera, SIZE, "depth", scale_map=drawing).depth)
+            assert (hit <= whole).mean() > 0.999
+        cut = renderer.render(surface, camera, SIZE, "depth", scale_map=drawing, clip=(*-ahead, 0.2)).depth
+        middle = np.linalg.norm(camera.eye)
+        assert cut[36, 48] == pytest.approx(middle + 1, abs=0.01)
+
+
+@pytest.mark.parametrize("drawing", (CAST, SPHERE))
 def test_eye_inside_sees_the_surface_all_around(renderers, drawing):
     """The eye's plane cuts the map: triangles that cross it are drawn where they lie in front."""
     surface = twin.smooth_map(16)
@@ -204,7 +225,7 @@ def test_layers_are_drawn_and_named(renderers):
 
 def test_scale_normals(device):
     """Four neighbours against the twin; the gradient against the exact normals of a smooth shape, on edges too."""
-    from clsurf.render.scale_map import scale_normals, upload_scale_map
+    from clsurf.render.scale_map import scale_normals
     exact = []
     for size in (16, 32, 64):
         surface = twin.smooth_map(size, OFFSET)
@@ -217,6 +238,54 @@ def test_scale_normals(device):
         exact.append((off[:, 1:-1, 1:-1].max(), off.max()))
         assert np.median(off) < 0.7 * np.median(rough)
     assert (np.log2(np.divide(exact[:-1], exact[1:])) > 1.9).all(), exact
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_displace_nodes(device, monkeypatch, lanes):
+    """Nodes of a geosphere lie on the map, holes are no nodes, and normals are the texels' own in between."""
+    monkeypatch.setattr(device, "lanes", lanes)
+    base = twin.smooth_map(12, f=bumpy)
+    valid = np.random.default_rng(0).uniform(size=base.valid.shape) > 0.05
+    surface = ScaleMap(base.center, base.radius, base.scales, valid)
+    cells = cells_of(device, upload_scale_map(device, surface), ScaleMapDrawing("geosphere", 3))
+    directions = geosphere_directions(8).reshape(-1, 3)
+    got = device.download(cells.positions)[:, :len(directions)].T
+    wanted = twin.displace_nodes(surface, directions)
+    assert (np.isnan(got) == np.isnan(wanted)).mean() > 0.999
+    assert np.nanmax(np.abs(got - wanted)) < 1e-5
+    nodes = device.download(cells.nodes)
+    exact = np.linalg.norm(nodes[:, :3], axis=1)
+    assert np.abs(exact - 1).max() < 1e-5 and (nodes[:, :3] * directions).sum(axis=1).min() > 0.3
+
+
+def test_project_cells(device):
+    """Where a block may touch the picture holds every pixel that its cells are drawn at, in both forms."""
+    from clsurf.render.scale_map import place_scale_map, project_cells
+    from clsurf.render.tiles import Scratch
+    surface, size = twin.smooth_map(10, f=bumpy), (64, 48)
+    upload = upload_scale_map(device, surface)
+    cells = cells_of(device, upload, CAST)
+    found = []
+    for lanes in (16, 8, 1):
+        for camera in cameras():
+            view, cull = place_scale_map(upload, None, camera, size, (1, 1, 1))
+            scratch = Scratch(device, lanes)
+            _, touch = project_cells(device, scratch, cells, device.upload(view), cull)
+            full, keys = device.download(touch.full).astype(int), device.download(touch.keys)
+            points = device.download(cells.positions)[:, :6 * cells.side**2].T.reshape(6, cells.side, cells.side, 3)
+            seen = (points * surface.radius - camera.eye) @ camera.rotation.T
+            p = camera.projection(size)
+            x = (p.fx * seen[..., 0] / (-seen[..., 2] if p.perspective else 1) + p.cx).reshape(-1)
+            shown = full[:, 0] <= full[:, 2]
+            assert cull and 0.3 < shown.mean() < 0.8
+            assert 4 * full[shown, 0].min() <= max(x.min() - 0.5, 0) + 4
+            assert 4 * full[shown, 2].max() + 4 >= min(x.max() - 0.5, size[0])
+            near = np.where(keys[shown] & 0x80000000, keys[shown] ^ np.uint32(0x80000000), ~keys[shown])
+            assert near.view(np.float32).min() == pytest.approx(-seen[..., 2].max(), abs=0.02)
+            found.append((full[shown], shown))
+    for k in (0, 1):
+        for other in found[k + 2::2]:
+            assert np.array_equal(found[k][1], other[1]) and np.abs(found[k][0] - other[0]).max() <= 1
 
 
 def test_stored_normals_and_their_absence(renderers):

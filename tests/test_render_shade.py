@@ -18,8 +18,9 @@ from clsurf.io import images
 from clsurf.render.camera import Camera
 from clsurf.render.renderer import Renderer, render, shared_renderer
 from clsurf.render.scene import Scene
-from clsurf.render.shade import Light, Shading, shading_floats, to_linear
+from clsurf.render.shade import Light, Shading, shading_floats
 from clsurf.render.tiles import view_floats
+from clsurf.surface.srgb import to_linear
 
 SIZE = (60, 44)
 GOLDEN = Path(__file__).parent / "golden"

@@ -211,7 +211,8 @@ def test_colours_come_from_points_and_colour_maps(device, renderers):
 def test_what_lies_outside_the_picture_is_not_drawn_and_changes_nothing(device, ring):
     with Renderer(device) as renderer:
         whole = renderer.render(ring, Camera.orthographic((0, 0, 5), (0, 0, 0), (0, 1, 0), 3.2), (128, 128), ALL[:3])
-        part = renderer.render(ring, Camera.orthographic((0.8, 0.4, 5), (0.8, 0.4, 0), (0, 1, 0), 0.8), (32, 32), ALL[:3])
+        near = Camera.orthographic((0.8, 0.4, 5), (0.8, 0.4, 0), (0, 1, 0), 0.8)
+        part = renderer.render(ring, near, (32, 32), ALL[:3])
         away = renderer.render(ring, Camera.look_at((0, 0, 5), (0, 0, 9), (0, 1, 0), 40), (32, 32), ALL)
     x, y = int(64 + 0.8 / 3.2 * 128) - 16, int(64 - 0.4 / 3.2 * 128) - 16
     same = np.isclose(whole.depth[y:y + 32, x:x + 32], part.depth, atol=1e-5, equal_nan=True)

@@ -7,11 +7,16 @@ from reference import trace as twin
 from reference.surfaces import fitted, leaves, plane_points, sphere, torus_points
 
 from clsurf.errors import InputError
+from clsurf.render import casters
 from clsurf.render.camera import Camera
+from clsurf.render.casters import occluder_view
 from clsurf.render.renderer import Renderer
 from clsurf.render.scene import Scene
 from clsurf.render.shade import Light, Shading, shading_floats
-from clsurf.render.traced_light import occluder_view, sphere_lamps
+from clsurf.render.tiles import view_floats
+from clsurf.render.traced_light import sphere_lamps
+from clsurf.surface.patch import PatchSurface
+from clsurf.trace.kinds import Traced, traced
 from clsurf.trace.packets import trace_lights
 from clsurf.trace.slim import upload_traced
 
@@ -112,7 +117,7 @@ def test_shadows_of_many_lamps_add_up(device):
     apart = sum(picture(device, [light]).color[..., :3] * (picture(device, [light]).id >= 0)[..., None]
                 for light in lights[::8])
     some = picture(device, lights[::8])
-    assert np.allclose(some.color[..., :3][some.id >= 0], apart[some.id >= 0], atol=1e-5)
+    assert np.allclose(some.color[..., :3][some.id >= 0], apart[some.id >= 0], atol=1e-5, rtol=1e-5)
     assert together[some.id >= 0].max() > apart[some.id >= 0].max()
     with pytest.raises(InputError, match="at most 32 lights"):
         picture(device, [*lights, lights[0]])
@@ -121,7 +126,7 @@ def test_shadows_of_many_lamps_add_up(device):
 def test_a_headlight_throws_no_shadow(device):
     plain = Shading(ambient=0, diffuse=1, specular=0, color=(1, 1, 1))
     one, two = (picture(device, [Light()], shading) for shading in (MATTE, plain))
-    assert np.allclose(one.color, two.color, atol=1e-5)
+    assert np.allclose(one.color, two.color, atol=1e-5, rtol=1e-5)
 
 
 # Twins ----------------------------------------------------------------------------------------------------------------
@@ -137,7 +142,7 @@ def test_trace_lights(device, degree, lanes):
     directions = random.normal(size=(3, 3))
     lamps[:3, 1:4] = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     lamps[3:, 1:4] = [[2.0, 1.5, -1.0], [-0.3, 0.2, -1.5]]
-    view = occluder_view(upload_traced(device, surface), None, look, size)
+    view = occluder_view(surface.origin, None, look, size)
     with Renderer(device) as r:
         frame = r.render(surface, look, size, lod=0)
     depth, normals = frame.depth.astype(np.float64), frame.normal.astype(np.float64) @ look.rotation.T
@@ -171,7 +176,7 @@ def test_light_bins(device, lanes):
     pictures = {name: a.reshape(3, 4, 8, 8).transpose(0, 2, 1, 3).reshape(-1)[hit] for name, a in grid.items()}
     directions = sphere_lamps(16, look)[:, 1:4]
     hidden = pictures["hidden"][:, None] >> np.arange(32) & 1 > 0
-    view = occluder_view(upload_traced(device, ground()), None, look, size)
+    view = occluder_view(ground().origin, None, look, size)
     floats = shading_floats(shading, lights, (1, 1, 1), look)
     wanted = twin.light_bins(view, floats, reference.pixel_centres(size)[hit], frame.depth.ravel()[hit].astype(float),
                              frame.normal.reshape(-1, 3)[hit].astype(float) @ look.rotation.T, floats[:3],
@@ -196,3 +201,82 @@ def test_empty_and_lampless_scenes(device):
         assert np.isfinite(dark.color).all()
         lampless = r.render(Scene([sphere()], lights=[]), look, (20, 20), shading=MATTE, channels="color")
         assert lampless.color[10, 10, 0] == 0
+
+
+def roof(side=9, half=1.0, height=2.0):
+    """A flat square patch above the ground."""
+    step = 2 * half / (side - 1)
+    return PatchSurface(origins=[[-half, -half, height]], axis_x=[[step, 0, 0]], axis_y=[[0, step, 0]],
+                        axis_z_length=[0.01], size=[[side, side]], displacements=np.zeros(side * side, np.int8))
+
+
+OPEN = Shading(ambient=1, diffuse=0, specular=0, color=(1, 1, 1), occlusion=256, occlusion_reach=100.0)
+
+
+def openness(surfaces, lanes=16):
+    """World positions of what is seen of the ground, and how much light comes to them from all around."""
+    with Renderer(lanes=lanes) as r:
+        frame = r.render(Scene(surfaces, lights=[]), camera(), (60, 45), ("color", "position", "id"),
+                         shading=OPEN, lod=0)
+    there = frame.id == 0
+    return frame.position[there].astype(float) + frame.origin, frame.color[there][:, 0]
+
+
+def test_patches_occlude():
+    """Under a square roof the ground sees that much less of the sky: cosine-weighted solid angle of a rectangle."""
+    at, light = openness([ground(), roof(side=65)])
+    bare = openness([ground()])[1]
+    solid = 0.0
+    for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):  # four rectangles from the point's own foot
+        a, b = (1 + x * at[:, 0]) / 2.0, (1 + y * at[:, 1]) / 2.0
+        u, v = a / np.sqrt(1 + a * a), b / np.sqrt(1 + b * b)
+        solid = solid + u * np.arctan(b / np.sqrt(1 + a * a)) + v * np.arctan(a / np.sqrt(1 + b * b))
+    covered = solid / (2 * np.pi)
+    assert covered.max() > 0.2 and np.abs(bare - 1).max() < 1e-3
+    error = np.abs((1 - light) - covered)
+    assert error.mean() < 0.01 and error.max() < 0.05
+
+
+@pytest.mark.parametrize("light", [Light("directional", (0.6, 0.2, 1.0)), Light("point", (2.0, 1.0, 5.0))])
+def test_single_rays_cast_the_shadows_of_packets(device, monkeypatch, light):
+    """Whatever is traced casts: a kind needs to tell no more than where rays hit it."""
+    packets = picture(device, [light])
+    monkeypatch.setattr(casters, "traced", lambda device, surface: bare(traced(device, surface)))
+    singles = picture(device, [light])
+    on_plane = packets.id == 0
+    dark = packets.color[on_plane][:, 0] == 0
+    assert dark.sum() > 300 and ((singles.color[on_plane][:, 0] == 0) != dark).mean() < 0.01
+
+
+def bare(held):
+    return Traced(held.center, held.unit, held.box, held.launch)
+
+
+def test_lamp_rays(device):
+    """Rays of two bins against their twin, and the bits of those that hit something."""
+    random = np.random.default_rng(3)
+    look, size = camera(), (16, 8)
+    planes = random.normal(size=(2, 4, 64)).astype(np.float32)
+    planes[:, 0] = random.uniform(3, 6, (2, 64))
+    lamps = np.array([[1, 0.3, 0.5, 0.8, 0, 0, 0, 0], [2, 0.5, 2.0, -3.0, 0, 0, 0, 0]], np.float32)
+    place = np.append(np.hstack([np.linalg.qr(random.normal(size=(3, 3)))[0] / 2, random.normal(size=(3, 1))]), 2.0)
+    mask = random.integers(0, 4, (2, 64)).astype(np.uint32)
+    pixels = random.permutation(128).astype(np.int32)
+    view = view_floats(look, size)
+    buffers = [device.upload(array) for array in (pixels, view, place.astype(np.float32), lamps)]
+    on_device = device.empty((2, 64), np.uint32)
+    device.write(on_device, mask)
+    rays, wanted_mask = device.empty((128, 8), np.float32), mask.copy()
+    for lamp, reach in ((0, np.inf), (1, 2.0), (1, 100.0)):
+        device.kernel("trace/lamp_rays.cl", constants={"FIELDS": 4})(
+            (128,), (64,), 128, 0, *buffers, lamp, 0.1, reach, 2, device.upload(planes), on_device, 64, 0, rays)
+        got = device.download(rays)
+        before = device.download(on_device)
+        wanted = twin.lamp_rays(pixels, view, place, lamps[lamp], lamp, 0.1, reach, 2, planes, before)
+        assert np.allclose(got, wanted, atol=1e-5, rtol=1e-5)
+        hits = np.full((128, 8), np.inf, np.float32)
+        hits[::3, 0] = 1
+        device.kernel("trace/lamp_bits.cl")((128,), (64,), 128, 0, buffers[0], device.upload(hits), lamp, on_device,
+                                            64, 0)
+        wanted_mask.ravel()[pixels[::3]] |= np.uint32(1 << lamp)
+        assert np.array_equal(device.download(on_device), wanted_mask)

@@ -147,12 +147,12 @@ def test_ray_slim(device, lanes, degree, oriented):
     assert 100 < hits.hit.sum() < 150
 
 
-def test_neighbour_lists():
+def test_neighbour_lists(device):
     """Every bottom node lists those whose balls reach into its pieces, once each; empty and small trees too."""
     rng = np.random.default_rng(13)
     for count in (1, 16, 17, 700):
         center, half = rng.uniform(-1, 1, (count, 3)), rng.uniform(0, 0.1, (count, 1))
-        tree = plant(center - half, center + half)
+        tree = plant(device, center - half, center + half)
         boxes, balls = (node_boxes(tree, center - f * half, center + f * half) for f in (1, 2))
         first, near_boxes, near_nodes = neighbour_lists(tree, boxes, balls)
         pieces, whole = boxes[tree.first_bottom:], balls[tree.first_bottom:]

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from reference import view as twin
 from reference.surfaces import sphere
 from test_render_patches import globe
 
 import clsurf
 from clsurf.errors import DeviceError, InputError
-from clsurf.io.images import read_image, to_srgb8
+from clsurf.io.images import read_image
 from clsurf.view import picture
 from clsurf.view.controls import HELP, KEYS
 from clsurf.view.pace import BUDGET, FINE, FULL, SETTLE, STEPS, Pace
@@ -212,6 +213,16 @@ def test_moving_pictures_get_coarse_enough_and_no_coarser(full_seconds):
         assert qualities[-1].reduce == 1
     _, after = shown(pace, lambda q: 1e-4, 10.0, 20)  # something easier to draw
     assert (after[-1].reduce, after[-1].lod) == STEPS[0]
+
+
+def test_a_slow_canvas_gets_smaller_pictures():
+    """Drawn fast, but far apart: half the size, as long as it moves; none of it where the movement pauses."""
+    pace, qualities = shown(Pace(), lambda q: 0.01, 0.0, 12, gap=0.08)
+    assert [q.reduce for q in qualities[-8:]] == [2] * 8
+    _, qualities = shown(pace, lambda q: 0.01, 5.0, 12, gap=0.03)
+    assert qualities[-1].reduce == 1
+    _, qualities = shown(Pace(), lambda q: 0.01, 0.0, 12, gap=0.4)
+    assert qualities[-1].reduce == 1
 
 
 def test_still_pictures_are_refined_step_by_step():
@@ -441,11 +452,16 @@ def test_sizes_come_with_the_canvas(viewer):
     assert viewer.camera is mine
 
 
-def test_bytes_of_colours():
-    color = np.random.default_rng(0).random((9, 7, 4)).astype(np.float32)
-    color[..., 3] = 1
-    color[0, 0, :3] = (0, 1, 2)
-    assert np.abs(picture.to_bytes(color).astype(int) - to_srgb8(color)).max() <= 1
+@pytest.mark.parametrize("size", [(9, 7), (64, 65), (1, 1)])
+def test_pack_bytes(size, device):
+    color = np.random.default_rng(0).random((*size, 4)).astype(np.float32)
+    color[..., :3] *= color[..., 3:]
+    color[0, 0] = (-1, 1, 50, 1)
+    got = picture.to_bytes(device, color)
+    assert got.shape == color.shape and got.dtype == np.uint8 and (got[0, 0] == (0, 255, 255, 255)).all()
+    assert np.abs(got.astype(int) - twin.pack_bytes(color)).max() <= 1  # 4096 levels
+    color[0, 0, 0] = np.nan
+    assert picture.to_bytes(device, color)[0, 0, 0] == 0
 
 
 def test_nothing_to_see_is_shown(device):
@@ -458,8 +474,7 @@ def test_nothing_to_see_is_shown(device):
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
-    ({"camera": 3}, "camera"), ({"up": (0, 0, 0)}, "up"), ({"size": (0, 3)}, "size"),
-    ({"background": (1, 1, 1, 0.5)}, "background")])
+    ({"camera": 3}, "camera"), ({"up": (0, 0, 0)}, "up"), ({"size": (0, 3)}, "size")])
 def test_wrong_arguments(arguments, says, device):
     with pytest.raises(InputError, match=says):
         clsurf.Viewer(sphere(50), device=device, **arguments)

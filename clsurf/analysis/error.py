@@ -39,8 +39,8 @@ class SurfaceError:
     Attributes
     ----------
     distance : (n,) float64
-        From every finite point of the scan to the surface. From SLIM surfaces and surfel hierarchies signed, positive on the side that the
-        normals point to; from meshes and patches 0 or more.
+        From every finite point of the scan to the surface. From SLIM surfaces and surfel hierarchies signed, positive
+        on the side that the normals point to; from meshes and patches 0 or more.
     diagonal : float
         Of the scan's bounding box without outliers, world units: what `relative` divides by.
     backward : SurfaceError or None
@@ -118,8 +118,8 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
     """
     scan = _as_scan(scan)
     if not isinstance(surface.surface if isinstance(surface, Placed) else surface, MEASURED | Mesh):
-        raise InputError("surface: expected a SlimSurface, a PatchSurface, a SurfelHierarchy, a ScaleMap or a Mesh, got "
-                         f"{type(surface).__name__}")
+        raise InputError("surface: expected a SlimSurface, a PatchSurface, a SurfelHierarchy, a ScaleMap or a Mesh, "
+                         f"got {type(surface).__name__}")
     if both and not (isinstance(scan, Mesh) and len(scan.faces)):
         raise InputError("both: expected a scan with faces to measure the surface's points against, got points only")
     device = open_device(device)

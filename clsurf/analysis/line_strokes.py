@@ -12,8 +12,8 @@ from ..io import images
 from ..io.files import replacing
 from ..render.frame import Frame
 from ..render.renderer import checked_size
-from ..render.shade import to_linear
 from ..surface.arrays import frozen
+from ..surface.srgb import to_linear
 
 # sRGB, 0 to 1; ridges blue and valleys red as in the paper's figure 12.
 COLORS = {"contours": (0.0, 0.0, 0.0), "suggestive_contours": (0.0, 0.0, 0.0), "ridges": (0.05, 0.15, 0.60),

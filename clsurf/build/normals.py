@@ -14,7 +14,7 @@ from .orientation import oriented_to, signs_of, voxel_means
 
 ORIENTS = ("auto", "scanners", "graph", "up")
 LIDAR_ATTRIBUTES = {"classification", "return_number", "number_of_returns", "scan_angle", "scan_angle_rank"}
-NOISY = 0.38  # see _suitable_k
+NOISY = 0.38  # see suitable_k
 # Side of a voxel over (k-th distance / sqrt(k)): about 2.8 point spacings, 1.25 times the 16th distance. 4, 5, 6, 8:
 # raw scans 0.97, 0.99, 1.02, 1.10 % wrong with 385, 250, 174, 97 thousand voxels.
 VOXEL = 5.0
@@ -70,7 +70,7 @@ def estimate_normals(cloud: PointCloud, k="auto", orient="auto", progress=None, 
     report(0.0)
     points, inverse = distinct(cloud.points)
     tree = box_tree(points, device)
-    k = _suitable_k(tree) if k == "auto" else k
+    k = suitable_k(tree) if k == "auto" else k
     found = covariance(tree, k)
     report(0.3)
     normals = found.normals.copy()
@@ -134,7 +134,7 @@ def distinct(points) -> tuple[NDArray, NDArray | None]:
     return (kept, inverse.ravel()) if len(kept) < len(points) else (points, None)
 
 
-def _suitable_k(tree) -> int:
+def suitable_k(tree) -> int:
     """Return 16, or 48 where 16 points spread across the surface nearly as much as along it.
 
     The median ratio of the two spreads is 0.03-0.13 on clean scans, 0.2-0.34 on scans with noise added for tests of

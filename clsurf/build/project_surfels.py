@@ -85,7 +85,7 @@ def on_triangles(surface: SurfelHierarchy, points: NDArray, device: Device) -> N
 
 
 def barycentric_foot(points: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray:
-    """Return barycentric coordinates (n, 3) of the places of the triangles a, b, c (n, 3) that are nearest to points."""
+    """Return barycentric coordinates (n, 3) of the places of triangles a, b, c (n, 3) that are nearest to points."""
     e, f, d = b - a, c - a, points - a
     dot = lambda x, y: (x * y).sum(axis=1)  # noqa: E731
     ee, ef, ff, de, df = dot(e, e), dot(e, f), dot(f, f), dot(d, e), dot(d, f)

@@ -73,15 +73,28 @@ def measure_noise(tree: PointTree) -> Noise:
     neighbors = min(10, tree.count - 1)
     if neighbors < 3:
         return Noise(0.0, 1.0)
+    spread, furthest2 = neighbour_spreads(tree, chosen)
+    real = spread >= 0
+    return noise_of(spread[real], furthest2[real], neighbors)
+
+
+def neighbour_spreads(tree: PointTree, chosen: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the smallest eigenvalue of ten neighbours' covariance and the square of their reach, (c, BLOCK) each.
+
+    `chosen` (c,) int32 are blocks of the tree, whose points are looked at; the first is -1 where there is none.
+    """
     device = tree.device
-    spread, furthest2 = device.empty((wanted, BLOCK), np.float32), device.empty((wanted, BLOCK), np.float32)
-    kernel = device.kernel("build/neighbor_spread.cl", constants={"NEIGHBORS": neighbors})
-    start_reach = 2.0 / math.sqrt(tree.count)
-    kernel((wanted,), (1,), wanted, device.upload(chosen), *tree.arguments, start_reach, spread, furthest2)
-    values = device.download(spread, copy=False)
-    real = values >= 0
-    median2 = float(np.median(device.download(furthest2, copy=False)[real]))
-    return Noise(float(values[real].astype(np.float64).mean()), math.sqrt(median2 * math.pi / (neighbors + 0.5)))
+    spread, furthest2 = device.empty((len(chosen), BLOCK), np.float32), device.empty((len(chosen), BLOCK), np.float32)
+    kernel = device.kernel("build/neighbor_spread.cl", constants={"NEIGHBORS": min(10, tree.count - 1)})
+    kernel((len(chosen),), (1,), len(chosen), device.upload(chosen), *tree.arguments, 2.0 / math.sqrt(tree.count),
+           spread, furthest2)
+    return device.download(spread), device.download(furthest2)
+
+
+def noise_of(spread: NDArray, furthest2: NDArray, neighbors: int) -> Noise:
+    """Return the noise of a scan from the points' values of `neighbour_spreads`."""
+    median2 = float(np.median(furthest2))
+    return Noise(float(spread.astype(np.float64).mean()), math.sqrt(median2 * math.pi / (neighbors + 0.5)))
 
 
 def automatic_error(noise: Noise) -> float:

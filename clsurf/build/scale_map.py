@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
 from ..io import load
-from ..surface.cube import texel_angles, texel_directions
+from ..surface.cube import interpolated, texel_angles, texel_directions
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
@@ -29,6 +29,8 @@ LARGEST_SIZE, LARGEST_LAYERS = 4096, 64
 BOUND_SHARE = 0.95
 TOLERANCE = 1e-5  # of the radius: hits so far beyond the sphere still count as on it
 VISIBLE_SIZE = 24  # texels across a face of the maps that look for the centre that sees most
+NEAR_SHARE = 0.03  # of the radius: how near a map must come to a sample to hold it
+SAMPLES = 4000  # of the surface, for that
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +52,8 @@ def build_scale_map(thing, size: int = 128, center=None, radius: float | None = 
     size : int
         Texels along a side of a cube face.
     center : (3,) float or "visible", optional
-        World. By default the centre of the bounding sphere; "visible": a place from which most rays meet the model
-        exactly once, found by search.
+        World. By default the centre of the bounding sphere; "visible": the place whose map holds the largest share
+        of the model's surface, found by search.
     radius : float, optional
         Of the sphere that distances are relative to, world units; what lies outside is left out. By default it holds
         the model.
@@ -82,7 +84,7 @@ def build_scale_map(thing, size: int = 128, center=None, radius: float | None = 
     """
     if isinstance(thing, str | os.PathLike):
         thing = load(thing)
-    _check(size, bits, layers, hit, radius)
+    check_options(size, bits, layers, hit, radius)
     device, report = open_device(device), _Reporter(progress)
     report(0.0)
     source = _source(thing, device)
@@ -122,10 +124,9 @@ def radial_bound(surface: ScaleMap, points: NDArray | None) -> float:
 
     The nearest distance is no larger. NaN without points.
     """
-    from ..surface.cube import interpolated
     if points is None or not len(points):
         return float("nan")
-    points = points[:: max(1, len(points) // 20_000)] - surface.center
+    points = points[::max(1, len(points) // 8_000)] - surface.center
     distance = np.linalg.norm(points, axis=1)
     points, distance = points[distance > 0], distance[distance > 0]
     best = np.full(len(points), np.inf)
@@ -136,7 +137,8 @@ def radial_bound(surface: ScaleMap, points: NDArray | None) -> float:
     return found if np.isfinite(found) else float("nan")
 
 
-def _check(size, bits, layers, hit, radius) -> None:
+def check_options(size=128, bits=8, layers=1, hit="outermost", radius=None) -> None:
+    """Raise InputError unless the options can be used."""
     for name, value, most in (("size", size, LARGEST_SIZE), ("layers", layers, LARGEST_LAYERS)):
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or not 1 <= value <= most:
             raise InputError(f"{name}: expected a whole number from 1 to {most}, got {value!r}")
@@ -189,6 +191,16 @@ class _Triangles:
 
     def reach(self, center) -> float:
         return float(np.sqrt(((self.points - center) ** 2).sum(axis=1).max()))
+
+    def samples(self) -> NDArray:
+        """Return points (n, 3), world, evenly spread over the area, the same each time."""
+        corners = self.world[self.device.download(self.faces)]
+        edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        ends = np.cumsum(np.linalg.norm(np.cross(edge, other), axis=1))
+        face = np.searchsorted(ends, (np.arange(SAMPLES) + 0.5) / SAMPLES * ends[-1])
+        u, v = np.random.default_rng(0).uniform(size=(2, SAMPLES, 1))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        return corners[face, 0] + u * edge[face] + v * other[face]
 
     def cast(self, center, radius, size, layers, outermost, normals) -> RayHits:
         device, texels = self.device, 6 * size * size
@@ -245,6 +257,14 @@ class _Traced:
 
     def reach(self, center) -> float:
         return float(np.linalg.norm(self.corners - center, axis=1).max())
+
+    def samples(self) -> NDArray:
+        """Return the points (n, 3), world, that rays from the middle of the box meet."""
+        center = self.sphere_center()
+        found = trace(self.thing, center, texel_directions(VISIBLE_SIZE).reshape(-1, 3), "all", device=self.device)
+        if not len(found.position):
+            raise InputError("center: no ray from the middle of the box meets the model: name a centre")
+        return found.position
 
     def cast(self, center, radius, size, layers, outermost, normals) -> RayHits:
         directions = texel_directions(size).reshape(-1, 3)
@@ -303,15 +323,21 @@ def _center(center, source, size, hit, report) -> NDArray:
 
 
 def _seeing_center(source, hit, report) -> NDArray:
-    """Return the place from which most rays, by solid angle, meet the model exactly once.
+    """Return the place whose map holds the largest share of the model's surface, as samples of it tell.
 
     A grid of 4 x 4 x 4 places in the box and the sphere's centre, then steps along the axes, halved where none helps.
+    The share of rays that meet the model once is no such measure: close to the surface it is large, and most of the
+    model is seen at a glancing angle.
     """
-    angles = texel_angles(VISIBLE_SIZE)
+    samples = source.samples()
+    near = NEAR_SHARE * source.reach(source.sphere_center())
 
     def seen(center) -> float:
-        hits = source.cast(center, 2 * source.reach(center), VISIBLE_SIZE, 1, hit == "outermost", False)
-        return float(((hits.counts == 1) * angles).sum())
+        sphere = 2 * source.reach(center)
+        hits = source.cast(center, sphere, VISIBLE_SIZE, 1, hit == "outermost", False)
+        apart = samples - center
+        there, known = interpolated(hits.distances[0], hits.distances[0] >= 0, apart)
+        return float(np.mean(known & (np.abs(there * sphere - np.linalg.norm(apart, axis=1)) < near)))
 
     middle = np.asarray(source.sphere_center(), np.float64)
     box = np.stack([np.min(source.points, axis=0), np.max(source.points, axis=0)]) if source.points is not None \

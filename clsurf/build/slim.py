@@ -4,45 +4,36 @@ Source: Ohtake, Belyaev, Alexa, "Sparse Low-degree Implicit Surfaces with Applic
 Feature Extraction, and Smoothing", SGP 2005, section 2.
 """
 
-import itertools
+import math
 import os
 import re
-from dataclasses import dataclass, replace
+import tempfile
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from ..device import open_device
 from ..errors import Cancelled, DeviceMemoryError, InputError
-from ..io import load
+from ..io import load, save
 from ..io.cleaning import first_of_duplicates
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
-from ..surface.slim import COEFFICIENTS, SlimSurface
-from ..surface.srgb import premultiplied, straight
+from ..surface.slim import COEFFICIENTS
 from .large_faces import large_faces, with_middles
-from .point_tree import BLOCK, FAR_POINT, PointTree, build_point_tree
-from .project import leaf_tree, project_sorted
-from .radius import LEAST_PENALTY, Noise, automatic_error, measure_noise, robust_box, segment_end
+from .point_tree import build_point_tree
+from .radius import LEAST_PENALTY, automatic_error, measure_noise, robust_box
+from .slim_levels import Points, assemble, build_levels, with_bound
 
-GAMMA = 0.1  # overlap that every point must have (paper: 0.1)
-OVERLAP_ONE = 1 << 20  # fixed point of the overlap sums (cover_points.cl)
-LEVELS = 25  # the last one's balls are 1e-6 of the diagonal, the rounding of the coordinates
-CENTER = 2  # state of a chosen point (choose_centers.cl)
-# Centres of a level's rounds stand so far apart, over r_r: the first round's balls hold or cover most points, the later
-# ones fill the gaps between leaves. r_r throughout gave 5 % more leaves at the same error and three times the rounds.
-SPACINGS = (1.0, 0.5, 0.4, 0.3, 0.2)
-RECORD = 16  # floats a fitted surfel (fit_surfels.cl)
-BOUND_SHARE = 0.999  # of the scan's points lie within `bound` of the surface
-BOUND_SAMPLES = 1 << 16  # points that the bound is taken from
+LOADED_BYTES, BYTES_PER_LOADED_POINT = 330_000_000, 200  # of a process that loads and builds, normals estimated
+LEAST_LINE = 20  # bytes of a point in text
 BYTES_PER_POINT, FIXED_BYTES = 64, 20_000_000  # of a build's memory beyond the scan
-SEGMENT, FORCED, FIXED = 0, 1, 2  # modes of fit_surfels.cl
 
 
-def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progress=None, device=None) -> SlimSurface:
+def build_slim(scan, degree=2, error=None, weight=None, memory_limit=None, progress=None, device=None, tolerance=None,
+               out=None, scheduler=None):
     """Build a multi-scale SLIM surface from a scan.
 
     Parameters
@@ -52,20 +43,32 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
         this order; those of range images face the sensors. Points that are not finite or have no normal are left out.
     degree : int
         Of the local polynomials: 1, 2 or 3.
-    error : float or "auto"
+    error : float or "auto", optional
         T_MDL (paper, equation 3), the trade-off between accuracy and sparseness, relative to the diagonal of the
-        bounding box without outliers; "auto": from the scan's noise and spacing.
+        bounding box without outliers; "auto": from the scan's noise and spacing. By default 0.01, or "auto" where the
+        scan is streamed.
     weight : (n,) array_like, optional
         Confidence of every point, 0 or more; 0 leaves a point out.
     memory_limit : int or str, optional
-        Bytes that the build may take beyond the scan, such as "2GB".
+        Bytes that the build may take beyond the scan, such as "2GB"; for a path, those of the whole process: a scan
+        that does not fit is streamed.
     progress : callable, optional
         Called as progress(stage, done) with done from 0 to 1; returning False stops the build.
     device : None, str or Device
+    tolerance : float, optional
+        World units: points that the surface does not come so near get surfels of their own, down to a disc each.
+        Vegetation and wires in airborne lidar need it; a quarter of the point spacing is kept by 99 % of the points.
+    out : path-like, optional
+        A .clsurf to write. With a path to LAS, LAZ, COPC, PLY or text as `scan`, the scan is streamed: read once in
+        chunks, cut into cells and written cell by cell into the folder OUT.part, which gets its name when it is whole.
+        The same call goes on with an unfinished one. Faces are ignored then.
+    scheduler : str or distributed.Client, optional
+        With `out`: a Dask scheduler whose workers build the cells, "tcp://host:8786", or "local" for processes of this
+        machine. The workers see the same files.
 
     Returns
     -------
-    SlimSurface
+    SlimSurface, or StoredSurface where it was streamed to `out`
         `bound` holds for `bound_share` of the scan's points. The same input gives the same bytes on one device.
 
     Raises
@@ -76,14 +79,28 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
     DeviceMemoryError
         More memory needed than the limit or the device allows.
     Cancelled
-        `progress` returned False; nothing is left behind.
+        `progress` returned False; nothing is left behind, except for the OUT.part of a streamed build.
     """
     if degree not in COEFFICIENTS:
         raise InputError(f"degree: expected 1, 2 or 3, got {degree!r}")
-    if error != "auto" and not (isinstance(error, int | float | np.number) and 0 < error < 1):
+    if error not in ("auto", None) and not (isinstance(error, int | float | np.number) and 0 < error < 1):
         raise InputError(f"error: expected a share of the diagonal between 0 and 1, or 'auto', got {error!r}")
+    if tolerance is not None and not (isinstance(tolerance, int | float | np.number) and 0 < tolerance < math.inf):
+        raise InputError(f"tolerance: expected a distance in world units above 0, got {tolerance!r}")
     if isinstance(scan, str | os.PathLike):
+        limit = parse_bytes(memory_limit)
+        if weight is None and wants_stream(scan, limit, out):
+            return streamed_slim(scan, out, limit, progress, device, degree=degree, error=error or "auto",
+                                 tolerance=tolerance, scheduler=scheduler)
         scan = load(scan)
+    if scheduler is not None:
+        raise InputError("scheduler: expected the path of a LAS, LAZ, COPC, PLY or text scan and out=, got a "
+                         f"{type(scan).__name__}")
+    if out is not None:
+        surface = build_slim(scan, degree, error, weight, memory_limit, progress, device, tolerance)
+        save(surface, out)
+        return surface
+    error = 0.01 if error is None else error
     if isinstance(scan, RangeScan):
         scan = scan.to_points()
     if not isinstance(scan, Mesh | PointCloud):
@@ -103,12 +120,38 @@ def build_slim(scan, degree=2, error=0.01, weight=None, memory_limit=None, progr
     noise = measure_noise(tree)
     error = automatic_error(noise) if error == "auto" else float(error)
     report("points", 1.0)
-    levels = build_levels(tree, degree, max(noise.variance * error**2, LEAST_PENALTY), noise, report)
+    levels = build_levels(tree, degree, max(noise.variance * error**2, LEAST_PENALTY), noise, report,
+                          tolerance=math.inf if tolerance is None else tolerance / diagonal)
     surface = assemble(levels, points, tree, degree, error, diagonal, scan.origin)
     report("bound", 0.0)
     surface = with_bound(surface, tree, middle)
     report("bound", 1.0)
     return surface
+
+
+def wants_stream(path, limit: int | None, out) -> bool:
+    """Return whether a scan's file is to be streamed: where there is a place to stream to, or where memory lacks."""
+    from ..io.chunks import STREAMED, open_source
+    if Path(path).suffix.lower() not in STREAMED or (out is None and limit is None):
+        return False
+    source = open_source(path)
+    if out is not None and not source.faces:
+        return True
+    count = source.count or Path(path).stat().st_size // LEAST_LINE
+    return limit is not None and LOADED_BYTES + count * BYTES_PER_LOADED_POINT > limit
+
+
+def streamed_slim(path, out, limit: int | None, progress, device, **options):
+    """Return the surface of a streamed scan: opened where `out` names its place, otherwise whole in memory."""
+    from ..io.stored import StoredSurface
+    from .streamed import build_streamed
+    report = Reporter(progress)
+    if out is not None:
+        return StoredSurface(build_streamed(path, out, memory_limit=limit, report=report, device=device, **options))
+    with tempfile.TemporaryDirectory(prefix="clsurf-") as folder:
+        place = build_streamed(path, Path(folder) / "surface.clsurf", memory_limit=limit, report=report, device=device,
+                               **options)
+        return load(place)
 
 
 class Reporter:
@@ -121,16 +164,6 @@ class Reporter:
         """Report `done` (0 to 1) of `stage`; raises Cancelled."""
         if self.progress is not None and self.progress(stage, done) is False:
             raise Cancelled("build_slim: stopped by the progress callback")
-
-
-@dataclass
-class Points:
-    """The usable points of a scan, relative to its origin."""
-
-    position: NDArray  # (n, 3) float32
-    normals: NDArray  # (n, 3) float32
-    colors: NDArray | None  # (n, 4) uint8
-    weights: NDArray | None  # (n,) float32
 
 
 def usable_points(scan, weight, device) -> Points:
@@ -238,147 +271,3 @@ def face_normals(points: NDArray, faces: NDArray) -> NDArray:
     used = np.zeros(len(points), bool)
     used[faces] = True
     return np.where(used[:, None], normals[target], np.float32(0))
-
-
-@dataclass
-class Level:
-    """The surfels of one level, unit-diagonal units."""
-
-    center: NDArray  # (m,) int32, index among the sorted points
-    record: NDArray  # (m, RECORD) float32: radius, normal, e, leaf, coefficients
-
-
-def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, report,
-                 fixed_radius: float | None = None) -> list[Level]:
-    """Cover the points level by level until every point is covered by leaves.
-
-    Parameters
-    ----------
-    penalty : float
-        lambda T^2, over diagonal^4.
-    report : callable
-        report(stage, done).
-    fixed_radius : float, optional
-        One level of leaves of this radius (over the diagonal): for measuring orders of approximation.
-    """
-    device = tree.device
-    terms = (degree + 1) * (degree + 2) // 2
-    need = min(2 * min(terms, COEFFICIENTS[2]) + 2, tree.count)  # fewer over-fit; cubics become quadratics before
-    choose = device.kernel("build/choose_centers.cl")
-    weighted = {"WEIGHTED": 1} if tree.weighted else {}
-    fit = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree, **weighted})
-    cover = device.kernel("build/cover_points.cl")
-    mark_open = device.kernel("build/open_points.cl")
-    blocks = tree.padded // BLOCK
-    overlap, held = device.zeros(tree.padded, np.uint32), device.empty(tree.padded, np.uint8)
-    state = device.empty(tree.padded, np.uint8)
-    threshold = int(GAMMA * OVERLAP_ONE * 1.001) + 1
-    levels = []
-    for number in range(1, LEVELS + 1):
-        r_r = fixed_radius or segment_end(number)
-        mode = FIXED if fixed_radius else FORCED if number == LEVELS else SEGMENT
-        device.fill(held, 0)
-        centers, records = [], []
-        while True:
-            mark_open((blocks,), (16,), tree.count, blocks, threshold, overlap, held, state)
-            open_points = np.flatnonzero(device.download(state, copy=False) == 0)
-            if len(open_points) == 0:
-                break
-            spacing = r_r * SPACINGS[min(len(centers), len(SPACINGS) - 1)]
-            first, end, colors = tree.cells(spacing * 1.001, open_points)
-            first, end = device.upload(first), device.upload(end)
-            for start, stop in itertools.pairwise(colors):
-                choose((stop - start,), (1,), stop - start, start, first, end, spacing, *tree.arguments, state)
-            chosen = np.flatnonzero(device.download(state, copy=False) == CENTER).astype(np.int32)
-            center = device.upload(chosen)
-            record = device.empty((len(chosen), RECORD), np.float32)
-            fit((len(chosen),), (1,), len(chosen), center, r_r, noise.variance, penalty, noise.spacing, need, mode,
-                *tree.arguments, record)
-            cover((len(chosen),), (1,), len(chosen), center, record, *tree.arguments, overlap, held)
-            centers.append(chosen)
-            records.append(record)
-        if not centers:
-            break
-        records = [device.download(r, copy=False) for r in records]
-        levels.append(Level(np.concatenate(centers), np.concatenate(records)))
-        covered = np.count_nonzero(device.download(overlap, copy=False)[:tree.count] >= threshold)
-        report("levels", covered / tree.count)
-    return levels
-
-
-def link_levels(levels: list[Level], position: list[NDArray]) -> tuple[NDArray, NDArray]:
-    """Return child_offset and children: the children of an internal surfel are the next level's centres in its ball."""
-    first = np.concatenate([[0], np.cumsum([len(level.center) for level in levels])])
-    offsets, children = [np.zeros(1, np.int64)], []
-    for k, level in enumerate(levels):
-        inner = np.flatnonzero(level.record[:, 5] == 0)
-        count = np.zeros(len(level.center), np.int64)
-        if k + 1 < len(levels) and len(inner):
-            radius = float(level.record[inner[0], 0])
-            pairs = cKDTree(position[k][inner]).sparse_distance_matrix(cKDTree(position[k + 1]), radius + 2e-7,
-                                                                       output_type="ndarray")
-            order = np.lexsort((pairs["j"], pairs["i"]))
-            count[inner] = np.bincount(pairs["i"], minlength=len(inner))
-            children.append(pairs["j"][order] + first[k + 1])
-        offsets.append(count)
-    child_offset = np.cumsum(np.concatenate(offsets))
-    return child_offset.astype(np.int32), np.concatenate([np.zeros(0, np.int64), *children]).astype(np.int32)
-
-
-def assemble(levels, points: Points, tree, degree, error, diagonal, origin) -> SlimSurface:
-    """Return the surface in world units, its bound still unknown."""
-    position = [points.position[tree.order[level.center]] for level in levels]
-    child_offset, children = link_levels(levels, [p.astype(np.float64) / diagonal for p in position])
-    center = np.concatenate([level.center for level in levels])
-    record = np.concatenate([level.record for level in levels])
-    order = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3])  # of the monomials
-    terms = COEFFICIENTS[degree]
-    with np.errstate(over="ignore"):
-        coefficients = (record[:, 6:6 + terms] * diagonal ** (1.0 - order[:terms])).astype(np.float32)
-    coefficients[~np.isfinite(coefficients)] = 0  # a diagonal below 1e-19 bends more than float32 can say
-    footprint = surfel_footprints(tree, center, record, terms)
-    return SlimSurface(
-        degree=degree, error=error, origin=origin, centers=np.concatenate(position),
-        radii=record[:, 0] * diagonal, normals=record[:, 1:4], coefficients=coefficients,
-        level=np.repeat(np.arange(1, len(levels) + 1), [len(level.center) for level in levels]),
-        leaf=record[:, 5] > 0, child_offset=child_offset, children=children, fit_error=record[:, 4] * diagonal,
-        footprint=footprint if (footprint < 255).any() else None,
-        colors=None if points.colors is None else surfel_colors(tree, center, record, points.colors),
-        diagonal=diagonal)
-
-
-def surfel_footprints(tree: PointTree, center: NDArray, record: NDArray, terms: int) -> NDArray:
-    """Return the octagons (m, 8) uint8 around the leaves' own points; 255: not limited."""
-    device = tree.device
-    out = device.empty((len(center), 8), np.uint8)
-    device.kernel("build/surfel_footprints.cl")((len(center),), (1,), len(center), device.upload(center),
-                                                device.upload(record), terms, *tree.arguments, out)
-    return device.download(out)
-
-
-def surfel_colors(tree: PointTree, center: NDArray, record: NDArray, colors: NDArray) -> NDArray:
-    """Return colours (m, 4) uint8 sRGB with straight alpha: weighted means in premultiplied linear light."""
-    device = tree.device
-    sorted_colors = np.zeros((4, tree.padded), np.float32)
-    sorted_colors[:, :tree.count] = premultiplied(colors[tree.order]).T
-    out = device.empty((len(center), 4), np.float32)
-    device.kernel("build/surfel_colors.cl")((len(center),), (1,), len(center), device.upload(center),
-                                            device.upload(record), device.upload(sorted_colors), *tree.arguments, out)
-    return straight(device.download(out).astype(np.float64))
-
-
-def with_bound(surface: SlimSurface, tree: PointTree, middle: NDArray) -> SlimSurface:
-    """Return `surface` with the distance that BOUND_SHARE of the scan's points keep, from an even sample of them."""
-    device = tree.device
-    blocks = tree.padded // BLOCK
-    wanted = min(blocks, BOUND_SAMPLES // BLOCK)
-    chosen = np.arange(wanted) * blocks // wanted
-    host = device.download(tree.sorted, copy=False)[:3].reshape(3, blocks, BLOCK)
-    queries = np.ascontiguousarray(host[:, chosen]).reshape(3, -1)
-    real = queries[0] < FAR_POINT / 2
-    queries[:, ~real] = queries[:, :1]
-    leaves = leaf_tree(surface, device, middle.astype(np.float64))
-    result = project_sorted(leaves, device.upload(queries), queries.shape[1], queries.shape[1])
-    distance = np.abs(device.download(result, copy=False)[6, real])
-    return replace(surface, bound=float(np.quantile(distance, BOUND_SHARE)) * surface.diagonal,
-                   bound_share=BOUND_SHARE)

@@ -64,11 +64,7 @@ def build_surfels(scan, spacing=None, map_size=16, hybrid=False, memory_limit=No
     Cancelled
         `progress` returned False; nothing is left behind.
     """
-    if not isinstance(map_size, int | np.integer) or isinstance(map_size, bool) or not 1 <= map_size <= LARGEST_MAP:
-        raise InputError(f"map_size: expected a whole number of texels from 1 to {LARGEST_MAP}, got {map_size!r}")
-    number = isinstance(spacing, int | float | np.number) and not isinstance(spacing, bool)
-    if spacing is not None and not (number and 0 < spacing < np.inf):
-        raise InputError(f"spacing: expected a positive length in world units, got {spacing!r}")
+    checked_options(spacing, map_size, hybrid)
     if isinstance(scan, str | os.PathLike):
         scan = load(scan)
     if isinstance(scan, RangeScan):
@@ -78,8 +74,6 @@ def build_surfels(scan, spacing=None, map_size=16, hybrid=False, memory_limit=No
                          f"{type(scan).__name__}")
     if hybrid and not (isinstance(scan, Mesh) and len(scan.faces)):
         raise InputError("hybrid: expected a mesh with faces, got none: leave hybrid out")
-    if hybrid and spacing is not None:
-        raise InputError("spacing: expected with hybrid=False only: the finest level is the mesh itself")
     device = open_device(device)
 
     def report(stage, done):
@@ -97,6 +91,17 @@ def build_surfels(scan, spacing=None, map_size=16, hybrid=False, memory_limit=No
         parts.pop(name, None)
     return SurfelHierarchy(**parts, map_offset=map_offset, map_size=map_sizes, normal_atlas=atlas,
                            color_atlas=color_atlas, origin=scan.origin)
+
+
+def checked_options(spacing, map_size, hybrid) -> None:
+    """Raise InputError where an option of `build_surfels` is out of range."""
+    if not isinstance(map_size, int | np.integer) or isinstance(map_size, bool) or not 1 <= map_size <= LARGEST_MAP:
+        raise InputError(f"map_size: expected a whole number of texels from 1 to {LARGEST_MAP}, got {map_size!r}")
+    number = isinstance(spacing, int | float | np.number) and not isinstance(spacing, bool)
+    if spacing is not None and not (number and 0 < spacing < np.inf):
+        raise InputError(f"spacing: expected a positive length in world units, got {spacing!r}")
+    if hybrid and spacing is not None:
+        raise InputError("spacing: expected without hybrid only: the finest level is the mesh itself")
 
 
 def check_room(scan, map_size: int, hybrid: bool, memory_limit) -> None:

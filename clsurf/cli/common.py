@@ -57,6 +57,12 @@ class Steps:
             print(text, file=sys.stderr, flush=True)
 
 
+def is_surface(thing) -> bool:
+    """Return whether `thing` is a surface, and not a scan that one is built from."""
+    import clsurf
+    return isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.SurfelHierarchy | clsurf.ScaleMap)
+
+
 def checked_out(path: Path, endings=()) -> Path:
     """Return `path` if it can be written and ends in one of `endings`: told before the work, not after it."""
     if endings and path.suffix.lower() not in endings:

@@ -8,7 +8,7 @@ import typer
 
 from ..errors import InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
-from .common import PICTURES, DeviceOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
+from .common import PICTURES, DeviceOption, QuietOption, SizeOption, Steps, checked_out, is_surface, parsed_size
 
 TABLES, SCANS = (".npz", ".csv"), (".ply",)
 CHANNELS = ("mean", "gaussian", "k1", "k2")
@@ -140,7 +140,7 @@ def _picture(thing, view, size, channel, radius, limit, legend, steps, device):
 
     from ..analysis.color_maps import color_map
     surface = thing
-    if not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
+    if not is_surface(thing):
         with steps.step("build the surface that is seen"):
             surface = clsurf.build_slim(thing, progress=steps.progress, device=device)
         steps.say(f"  {surface}")

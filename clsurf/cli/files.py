@@ -7,19 +7,30 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
-from .common import DeviceOption, QuietOption, Steps, checked_out
+from .common import DeviceOption, QuietOption, Steps, checked_out, is_surface
 from .recipe import (
+    BitsOption,
+    CenterOption,
     DegreeOption,
     ErrorOption,
+    HitOption,
+    HybridOption,
     KindOption,
+    LayersOption,
+    MapSizeOption,
     MethodOption,
     NodesOption,
+    NormalsOption,
     PatchesOption,
     PreciseOption,
     SpacingOption,
+    TexelsOption,
     ViewsOption,
     recipe,
+    with_scale_map,
+    with_tolerance,
 )
+from .stream import checked_stream, stream
 
 
 def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
@@ -32,7 +43,7 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
     """Say what a file holds: counts, bytes, bounds; with a scan beside it, the surface's error."""
     import clsurf
     thing = clsurf.load(path)
-    surface = isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface)
+    surface = is_surface(thing)
     if against is not None and not surface and not len(getattr(thing, "faces", ())):
         raise InputError(f"{path}: expected a surface or a mesh to measure against {against}, got points only")
     if study is not None and surface:
@@ -44,6 +55,10 @@ def info(path: Annotated[Path, typer.Argument(help="A scan or a surface.")],
         _about_slim(thing)
     elif isinstance(thing, clsurf.PatchSurface):
         _about_patches(thing)
+    elif isinstance(thing, clsurf.SurfelHierarchy):
+        _about_surfels(thing)
+    elif isinstance(thing, clsurf.ScaleMap):
+        _about_scale_map(thing)
     elif hasattr(thing, "images"):
         for i, image in enumerate(thing.images):
             print(f"image {i:<3}{image}")
@@ -97,6 +112,31 @@ def _about_patches(surface) -> None:
     print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")
 
 
+def _about_surfels(surface) -> None:
+    import numpy as np
+    inner, levels = len(surface) - len(surface.base), np.bincount(surface.level)[1:]
+    finest = f"{len(surface.triangles):,} triangles of {len(surface.vertices):,} vertices" if surface.hybrid else \
+        f"{len(surface.base):,} base surfels"
+    print(f"finest   {finest}, spacing {surface.spacing:.4g}")
+    levels = levels if surface.hybrid else levels[:-1]
+    print(f"inner    {inner:,} surfels; by level " + ", ".join(f"{n:,}" for n in levels))
+    sizes, counts = np.unique(surface.map_size[:inner], return_counts=True)
+    covered = np.mean(surface.normal_atlas[:, 3] > 0) if len(surface.normal_atlas) else 1.0
+    print("maps     " + ", ".join(f"{n:,} of {s} x {s}" for s, n in zip(sizes, counts, strict=True)) +
+          f"; {covered:.1%} of {len(surface.normal_atlas):,} texels covered, colors "
+          f"{'no' if surface.color_atlas is None else 'yes'}")
+    print(f"error    bound {_bound(surface)}")
+def _about_scale_map(surface) -> None:
+    center = ", ".join(f"{v:.10g}" for v in surface.center)
+    print(f"texels   6 x {surface.size} x {surface.size}, {surface.bits} bits, layers {surface.layers}, {surface.hit} "
+          f"hits, normals {'no' if surface.normals is None else 'yes'}")
+    print(f"sphere   center [{center}], radius {surface.radius:.8g}")
+    print(f"rays     {surface.hole_share:.2%} of layer 0 without a hit; " +
+          ("with several hits: not known" if math.isnan(surface.multiple_share) else
+           f"{surface.multiple_share:.2%} of the sphere with several hits"))
+    print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")
+
+
 def _bound(surface) -> str:
     return "not stored" if math.isnan(surface.bound) else \
         f"{surface.bound:g} for {surface.bound_share:.1%} of the scan's points"
@@ -107,17 +147,31 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
           out: Annotated[Path, typer.Argument(help="The surface to write: .clsurf, or for slim .slim2t.")],
           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
           spacing: SpacingOption = None, nodes: NodesOption = "", method: MethodOption = "", views: ViewsOption = None,
-          precise: PreciseOption = False, device: DeviceOption = "", quiet: QuietOption = False):
-    """Turn a scan into a surface: SLIM surfels or spatial patches."""
+          precise: PreciseOption = False, map_size: MapSizeOption = None, hybrid: HybridOption = False,
+          size: TexelsOption = None, bits: BitsOption = None, layers: LayersOption = None,
+          normals: NormalsOption = False, hit: HitOption = "", center: CenterOption = "",
+          tolerance: Annotated[float, typer.Option(help="slim: world units; points that the surface does not come so "
+                                                   "near get surfels of their own [off].")] = 0.0,
+          memory: Annotated[str, typer.Option(help="slim: stream a LAS, LAZ, PLY or text scan within this memory, such "
+                                              "as 1GB; stopped builds go on with the same command.")] = "",
+          scheduler: Annotated[str, typer.Option(help="slim: stream the scan on the workers of a Dask scheduler, "
+                                                 "tcp://host:8786 or local; they see the same files.")] = "",
+          device: DeviceOption = "", quiet: QuietOption = False):
+    """Turn a scan into a surface: SLIM surfels, spatial patches, surfels with normal maps, or a spherical scale map."""
     import clsurf
     steps = Steps(quiet)
-    how = recipe(kind, degree, error, patches=patches, spacing=spacing, nodes=nodes, method=method, views=views,
-                 precise=precise)
-    checked_out(out, (".clsurf",) if how.kind == "patches" else (".clsurf", ".slim2t"))
+    how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing, nodes=nodes, method=method,
+                 views=views, precise=precise)
+    how = with_scale_map(how, size, bits, layers, normals, hit, center)
+    how = with_tolerance(how, tolerance)
+    if memory or scheduler:
+        stream(scan, checked_stream(how, memory, scheduler, out), how, memory, scheduler, device or None, steps)
+        return
+    checked_out(out, (".clsurf", ".slim2t") if how.kind in ("", "slim") else (".clsurf",))
     with steps.step("load"):
         loaded = clsurf.load(scan)
     steps.say(f"  {loaded}")
-    if isinstance(loaded, clsurf.SlimSurface | clsurf.PatchSurface):
+    if is_surface(loaded) and how.kind != "scale_map":
         raise InputError(f"{scan}: expected a scan, got a surface ({type(loaded).__name__})")
     if how.kind_for(loaded) == "patches":
         checked_out(out, (".clsurf",))
@@ -134,7 +188,8 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
 def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")],
             out: Annotated[Path, typer.Argument(help="The file to write; its ending chooses the format. Patches "
                                                 "become their nodes, joined by two triangles a cell where the format "
-                                                "has faces.")],
+                                                "has faces, scale maps likewise their texels; surfel hierarchies their "
+                                                "base surfels, or mesh.")],
             quiet: QuietOption = False):
     """Write a scan or a surface in another format."""
     import clsurf
@@ -142,13 +197,18 @@ def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")]
     from ..io.dispatch import WRITES
     from ..io.scans import WRITES as SCANS
     from ..surface.patch_mesh import patch_mesh
+    from ..surface.scale_mesh import scale_mesh
+    from ..surface.surfel import finest_scan
     steps = Steps(quiet)
     checked_out(out, WRITES)
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if isinstance(thing, clsurf.PatchSurface) and out.suffix.lower() in SCANS:
-        thing = patch_mesh(thing)
+    if isinstance(thing, clsurf.PatchSurface | clsurf.SurfelHierarchy) and out.suffix.lower() in SCANS:
+        thing = patch_mesh(thing) if isinstance(thing, clsurf.PatchSurface) else finest_scan(thing)
+        steps.say(f"  {thing}")
+    if isinstance(thing, clsurf.ScaleMap) and out.suffix.lower() in SCANS:
+        thing = scale_mesh(thing)
         steps.say(f"  {thing}")
     with steps.step("save"):
         clsurf.save(thing, out)

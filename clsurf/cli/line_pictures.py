@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
-from .common import PICTURES, Steps
+from .common import PICTURES, Steps, is_surface
 from .recipe import Recipe
 
 LinesOption = Annotated[str, typer.Option("--lines", help="Draw feature lines: some of contours,suggestive_contours,"
@@ -30,7 +30,7 @@ class LinePicture:
         with steps.step("load"):
             thing = clsurf.load(source)
         steps.say(f"  {thing}")
-        if isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
+        if is_surface(thing):
             return thing, thing
         with steps.step("build"):
             shown = how.build(thing, device, steps)

@@ -9,8 +9,18 @@ import typer
 from ..errors import InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
 from .color_maps import ChannelOption, LegendOption, LimitOption, channel_picture
-from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
-from .lights import LightOption, MirrorOption, OcclusionOption, ShadowsOption, lighting
+from .common import (
+    PICTURES,
+    DeviceOption,
+    ProfileOption,
+    QuietOption,
+    SizeOption,
+    Steps,
+    checked_out,
+    is_surface,
+    parsed_size,
+)
+from .lights import LightOption, MaterialOption, MirrorOption, OcclusionOption, ShadowsOption, SkyOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .motion import (
     CameraOption,
@@ -21,18 +31,39 @@ from .motion import (
     TurntableOption,
     motion,
 )
+from .output import AntialiasOption, BackgroundOption, BitsOption, ExposureOption, ToneOption, output
 from .raw_scans import AsOption, AttributeOption, EyeDomeOption, PointSizeOption, point_drawing, wants_scan
-from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
+from .recipe import (
+    DegreeOption,
+    ErrorOption,
+    HybridOption,
+    KindOption,
+    MapSizeOption,
+    PatchesOption,
+    Recipe,
+    SpacingOption,
+    parsed_error,
+    recipe,
+)
 
 SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
 LodOption = Annotated[float, typer.Option(help="slim: projected diameter in pixels below which coarser surfels serve; "
-                                          "8 is the fast mode, 0 draws leaves only.")]
+                                          "8 is the fast mode, 0 draws leaves only; surfels: the same near "
+                                          "silhouettes.")]
+InteriorOption = Annotated[float, typer.Option(help="surfels: projected diameter in pixels that they may have away "
+                                               "from silhouettes.")]
+NoMapsOption = Annotated[bool, typer.Option("--no-maps", help="surfels: one normal each, without normal maps.")]
 NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, exact, trilinear or homogeneous.")]
 CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
 AlphaOption = Annotated[bool, typer.Option("--alpha", help="patches: draw cells with transparent nodes, up to half "
                                            "their alpha.")]
+FormOption = Annotated[str, typer.Option(help="scale_map: cast (rays of pixels) or geosphere.")]
+FacesOption = Annotated[int, typer.Option(help="scale_map: subdivisions of the geosphere, 0 to 9; 6: 81,920 "
+                                          "triangles.")]
+MapNormalsOption = Annotated[str, typer.Option(help="scale_map: auto, stored, neighbours or gradient.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
-LookOption = Annotated[str, typer.Option(help="phong, flat, reflection (lines); slim: ball_size, ball_level.")]
+LookOption = Annotated[str, typer.Option(help="phong, physical, matcap, normal, flat, reflection (lines); slim: "
+                                              "ball_size, ball_level.")]
 
 
 def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg, .exr.")] = Path("clsurf-demo.png"),
@@ -79,20 +110,25 @@ def render(source: SourceArgument,
            channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id, and "
                                                       "those of --channel; .png and .jpg show "
                                                       "color.")] = "color,depth,normal",
-           shading: LookOption = "phong", light: LightOption = None, shadows: ShadowsOption = False,
-           occlusion: OcclusionOption = 0, mirror: MirrorOption = 0.0, supersampling: SamplesOption = 1,
+           shading: LookOption = "phong", material: MaterialOption = "", light: LightOption = None,
+           sky: SkyOption = "", shadows: ShadowsOption = False, occlusion: OcclusionOption = 0,
+           mirror: MirrorOption = 0.0, background: BackgroundOption = "", supersampling: SamplesOption = 1,
+           antialias: AntialiasOption = "none", tone: ToneOption = "none", exposure: ExposureOption = 0.0,
+           bits: BitsOption = 8,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
-           lines: LinesOption = "", on_white: OnWhiteOption = False, drawn_as: AsOption = "surface",
-           point_size: PointSizeOption = "", eye_dome: EyeDomeOption = None, attribute: AttributeOption = "",
-           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
-           spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
+           interior: InteriorOption = 16.0, no_maps: NoMapsOption = False,
+           lines: LinesOption = "", on_white: OnWhiteOption = False,
+           form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
+           drawn_as: AsOption = "surface", point_size: PointSizeOption = "", eye_dome: EyeDomeOption = None,
+           attribute: AttributeOption = "", kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "",
+           patches: PatchesOption = None, spacing: SpacingOption = None, map_size: MapSizeOption = None,
+           hybrid: HybridOption = False, profile: ProfileOption = False, device: DeviceOption = "",
            quiet: QuietOption = False):
     """Draw a surface, or a scan or its surface, into a picture, or into a moving one."""
     import clsurf
 
     from ..device import Profile
-    from ..render.average import checked_supersampling
     from ..render.renderer import checked_channels, checked_lod, checked_size
     # Every option is checked before the work.
     seen_from = direction or eye or target or (fov, ortho) != (None, None)
@@ -106,10 +142,14 @@ def render(source: SourceArgument,
         raise InputError(f"channels: expected color among them for a {out.suffix} picture, got {channels}: add it, or "
                          "write .exr")
     view = checked_view(direction, up, fov, eye, target, ortho)
-    how = recipe(kind, degree, error, patches=patches, spacing=spacing)
-    lit = lighting(shading, light, shadows, occlusion, mirror)
+    how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
+    surfels = clsurf.SurfelDrawing(interior, not no_maps)
+    lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
-    checked_supersampling(supersampling)
+    scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
+    written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel)
+    if written.background == "sky" and not sky:
+        raise InputError("--background sky: expected --sky beside it")
     as_it_is, points = wants_scan(drawn_as, lines, channel, kind), point_drawing(point_size, eye_dome, attribute)
     if colored:
         colored.prepared(how, degree)
@@ -124,7 +164,8 @@ def render(source: SourceArgument,
         if colored:
             return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
         frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
-                              device=chosen, supersampling=supersampling, patches=drawing, points=points)
+                              written.background, chosen, supersampling=supersampling, patches=drawing,
+                              surfels=surfels, scale_map=scale_map, points=points, antialias=written.antialias)
         if not strokes or not moving.moves:
             return frame
         return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
@@ -143,7 +184,7 @@ def render(source: SourceArgument,
         strokes.save(out, frame, None if coarse is thing else coarse, seen, picture_size, chosen, steps)
     elif not moving.moves:
         with steps.step("write"):
-            frame.save(out)
+            written.save(frame, out)
     steps.say(f"{'video' if moving.moves else 'picture'}: {out.resolve()}")
 
 
@@ -153,7 +194,8 @@ def report(source: SourceArgument,
            fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
-           spacing: SpacingOption = None, device: DeviceOption = "", quiet: QuietOption = False):
+           spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
+           device: DeviceOption = "", quiet: QuietOption = False):
     """Write one HTML page about a surface and a view of it: counts, operations, times, the picture."""
     import clsurf
 
@@ -161,7 +203,7 @@ def report(source: SourceArgument,
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     checked_out(out, (".html", ".htm"))
     view = checked_view(direction, up, fov, eye, target, ortho)
-    how = recipe(kind, degree, error, patches=patches, spacing=spacing)
+    how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     chosen = clsurf.open_device(device or None)
     thing = loaded_surface(source, how, chosen, steps)
@@ -177,7 +219,7 @@ def loaded_surface(source: Path, how: Recipe, device, steps: Steps, as_it_is: bo
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if not as_it_is and not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface):
+    if not as_it_is and not is_surface(thing):
         with steps.step("build"):
             thing = how.build(thing, device, steps)
         steps.say(f"  {thing}")

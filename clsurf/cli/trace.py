@@ -7,7 +7,7 @@ import typer
 
 from ..errors import FileFormatError, InputError
 from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
-from .common import DeviceOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
+from .common import DeviceOption, QuietOption, SizeOption, Steps, checked_out, is_surface, parsed_size
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, SpacingOption, recipe
 
 TABLES, DEPTHS = (".npz", ".csv"), (".exr", ".png")
@@ -46,7 +46,7 @@ def trace(source: Annotated[Path, typer.Argument(help="A surface, a mesh, or ano
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if not isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.Mesh) or (
+    if not (is_surface(thing) or isinstance(thing, clsurf.Mesh)) or (
             build and isinstance(thing, clsurf.Mesh)):
         with steps.step("build"):
             thing = how.build(thing, chosen, steps)

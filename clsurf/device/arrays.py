@@ -5,6 +5,7 @@ blocks come from mmap with huge pages and are kept for reuse: fresh pages cost m
 4 KB pages: about 8 ms here).
 """
 
+import ctypes
 import math
 import mmap
 import threading
@@ -26,7 +27,7 @@ class HostPool:
         # A finalizer may run inside take() (garbage collection), so the lock must be re-entrant.
         self._lock = threading.RLock()
         self._free: dict[int, list[mmap.mmap]] = {}
-        self.kept_bytes = 0
+        self.kept_bytes, self.kept_limit = 0, KEPT_BYTES
 
     def take(self, nbytes: int) -> NDArray:
         """Return a (nbytes,) uint8 array, page-aligned, content undefined."""
@@ -46,7 +47,7 @@ class HostPool:
 
     def _give(self, block, size):
         with self._lock:
-            if self.kept_bytes + size <= KEPT_BYTES:
+            if self.kept_bytes + size <= self.kept_limit:
                 self._free.setdefault(size, []).append(block)
                 self.kept_bytes += size
 
@@ -55,6 +56,14 @@ class HostPool:
         with self._lock:
             self._free.clear()
             self.kept_bytes = 0
+
+
+def give_back() -> None:
+    """Return the heap's unused pages to the system, where the C library can: they count as this process's memory."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (OSError, AttributeError, TypeError):
+        return
 
 
 def _size_class(nbytes: int) -> int:

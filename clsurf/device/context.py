@@ -15,7 +15,7 @@ import pyopencl as cl  # noqa: E402
 
 from ..errors import DeviceError, DeviceMemoryError  # noqa: E402
 from . import pocl_fork, pocl_target  # noqa: E402
-from .arrays import DeviceArray, HostPool, is_aligned, new_array  # noqa: E402
+from .arrays import KEPT_BYTES, DeviceArray, HostPool, give_back, is_aligned, new_array  # noqa: E402
 from .program import Kernel, Profile, build_program, make_kernel  # noqa: E402
 
 log = logging.getLogger("clsurf")
@@ -225,10 +225,18 @@ class Device:
         return {name: self.download(array, copy=False) if array.host is None else array.host
                 for name, array in arrays.items()}
 
+    def keep(self, nbytes: int | None) -> int | None:
+        """Keep at most `nbytes` of unused memory for reuse, or the default; return the limit before."""
+        if self.pool is None:
+            return None
+        before, self.pool.kept_limit = self.pool.kept_limit, KEPT_BYTES if nbytes is None else min(nbytes, KEPT_BYTES)
+        return before
+
     def trim(self) -> None:
         """Give the memory kept for reuse back to the system."""
         if self.pool is not None:
             self.pool.trim()
+        give_back()
 
     @_told
     def finish(self) -> None:

@@ -26,7 +26,7 @@ def load(path):
 
     Returns
     -------
-    Mesh, PointCloud, RangeScan, SlimSurface or PatchSurface
+    Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface or ScaleMap
 
     Raises
     ------

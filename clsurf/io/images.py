@@ -11,6 +11,7 @@ from clsurf.errors import FileFormatError, InputError
 from clsurf.surface.srgb import LINEAR_OF_BYTE, to_srgb
 
 from .files import existing_file, one_line, replacing
+from .tone import checked_tone, tone_mapped
 
 EIGHT_BIT = (".png", ".jpg", ".jpeg")
 ENDINGS = (*EIGHT_BIT, ".exr")
@@ -23,7 +24,13 @@ _MOST_COMPRESSED = 4000  # pixel bytes per file byte; deflate reaches 1032, so a
 
 
 def to_srgb8(color, background=None) -> NDArray:
-    """Convert linear premultiplied colour to 8-bit sRGB with straight alpha.
+    """Convert linear premultiplied colour to 8-bit sRGB with straight alpha; see `to_srgb_bytes`."""
+    return to_srgb_bytes(color, background)
+
+
+def to_srgb_bytes(color, background=None, tone: str = "none", exposure: float = 0.0, bits: int = 8,
+                  dither: bool = False) -> NDArray:
+    """Convert linear premultiplied colour to sRGB with straight alpha, of 8 or 16 bits.
 
     Parameters
     ----------
@@ -31,10 +38,16 @@ def to_srgb8(color, background=None) -> NDArray:
         Linear, premultiplied by alpha. (h, w, 3): opaque.
     background : (3,) float, optional
         Linear colour to lay `color` over; the result is then opaque. None keeps alpha.
+    tone, exposure
+        See `clsurf.io.tone.tone_mapped`.
+    bits : int
+        8 or 16.
+    dither : bool
+        Round up and down by an ordered pattern of 8 x 8, so that slow gradients show no steps; alpha is left alone.
 
     Returns
     -------
-    (h, w, 4) uint8
+    (h, w, 4) uint8 or uint16
         sRGB, straight alpha; a transparent pixel is black.
     """
     color = np.asarray(color, np.float32)
@@ -47,10 +60,22 @@ def to_srgb8(color, background=None) -> NDArray:
         alpha = np.ones_like(alpha)
     elif (alpha < 1).any():
         rgb = np.divide(rgb, alpha, out=np.zeros_like(rgb), where=alpha > 0)
-    out = np.empty((*color.shape[:2], 4), np.uint8)
-    out[..., :3] = _eight_bit(to_srgb(rgb))
-    out[..., 3:] = _eight_bit(alpha)
+    if bits not in (8, 16):
+        raise InputError(f"bits: expected 8 or 16 bits a channel, got {bits!r}")
+    shift = ordered_pattern(*color.shape[:2])[..., None] if dither else 0.0
+    out = np.empty((*color.shape[:2], 4), np.uint8 if bits == 8 else np.uint16)
+    out[..., :3] = _whole(to_srgb(tone_mapped(rgb, tone, exposure)), bits, shift)
+    out[..., 3:] = _whole(alpha, bits)
     return out
+
+
+def ordered_pattern(height: int, width: int) -> NDArray:
+    """Return offsets (h, w) float32 over -1/2 to 1/2, the middles of 64 equal parts, in Bayer's order."""
+    order = np.zeros((1, 1))
+    for _ in range(3):
+        order = np.block([[4 * order, 4 * order + 2], [4 * order + 3, 4 * order + 1]])
+    tile = ((order + 0.5) / 64 - 0.5).astype(np.float32)
+    return np.tile(tile, (-(-height // 8), -(-width // 8)))[:height, :width]
 
 
 def from_srgb8(pixels) -> NDArray:
@@ -81,7 +106,8 @@ def png_bytes(pixels) -> bytes:
     return buffer.getvalue()
 
 
-def write_image(path, pixels, background=None) -> None:
+def write_image(path, pixels, background=None, tone: str = "none", exposure: float = 0.0, bits: int = 8,
+                dither: bool = False) -> None:
     """Write one picture as .png, .jpg or .exr; the file appears whole or not at all.
 
     Parameters
@@ -92,13 +118,15 @@ def write_image(path, pixels, background=None) -> None:
         taken as sRGB and written as they are.
     background : (3,) float, optional
         Linear colour behind transparent float pixels. JPEG has no alpha: white if not given.
+    tone, exposure, bits, dither
+        Of float pixels that are not written as .exr, which stays linear; see `to_srgb_bytes`. 16 bits: .png only.
 
     Raises
     ------
     InputError
         An unknown ending, a wrong shape, or a place that cannot be written.
     """
-    path = _known(path)
+    path = checked_output(path, tone, exposure, bits)
     if path.suffix.lower() == ".exr":
         pixels = np.asarray(pixels, np.float32)
         if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
@@ -106,7 +134,8 @@ def write_image(path, pixels, background=None) -> None:
         _write_exr(path, {name: pixels[..., i] for i, name in enumerate("RGBA"[:pixels.shape[2]])})
         return
     jpeg = path.suffix.lower() != ".png"
-    pixels = _as_pixels(pixels, (1.0, 1.0, 1.0) if jpeg and background is None else background)
+    pixels = _as_pixels(pixels, (1.0, 1.0, 1.0) if jpeg and background is None else background, tone, exposure, bits,
+                        dither)
     if jpeg:
         if pixels.dtype != np.uint8:
             raise InputError("pixels: .jpg holds 8 bits a channel, got uint16: write .png instead")
@@ -121,7 +150,23 @@ def write_image(path, pixels, background=None) -> None:
     _write(path, spec, np.ascontiguousarray(pixels))
 
 
-def write_frame(path, channels, background=None) -> None:
+def checked_output(path, tone: str = "none", exposure: float = 0.0, bits: int = 8) -> Path:
+    """Return the path of a picture to be written, or raise InputError where it cannot be what the options say."""
+    path = _known(path)
+    checked_tone(tone, exposure)
+    if bits not in (8, 16):
+        raise InputError(f"bits: expected 8 or 16 bits a channel, got {bits!r}")
+    ending = path.suffix.lower()
+    if ending == ".exr" and (tone != "none" or exposure or bits != 8):
+        raise InputError(f"{path}: .exr holds linear light in 32 bits, got tone {tone}, exposure {exposure}, bits "
+                         f"{bits}: leave them out, or write .png")
+    if bits == 16 and ending != ".png":
+        raise InputError(f"{path}: {ending} holds 8 bits a channel, got bits=16: write .png instead")
+    return path
+
+
+def write_frame(path, channels, background=None, tone: str = "none", exposure: float = 0.0, bits: int = 8,
+                dither: bool = False) -> None:
     """Write a frame: its colour as .png or .jpg, or every channel as .exr.
 
     Parameters
@@ -133,18 +178,20 @@ def write_frame(path, channels, background=None) -> None:
         NAME or NAME.0, NAME.1, ...; all float32 (integers are exact up to 2^24).
     background : (3,) float, optional
         As for `write_image`; not used for .exr.
+    tone, exposure, bits, dither
+        As for `write_image`.
 
     Raises
     ------
     InputError
         An unknown ending, no colour for .png or .jpg, arrays of different sizes, or a place that cannot be written.
     """
-    path = _known(path)
+    path = checked_output(path, tone, exposure, bits)
     if path.suffix.lower() != ".exr":
         if "color" not in channels:
             raise InputError(f"{path}: a {path.suffix} picture needs the channel color, got "
                              f"{', '.join(channels) or 'none'}: ask for it with channels=, or write .exr")
-        write_image(path, channels["color"], background)
+        write_image(path, channels["color"], background, tone, exposure, bits, dither)
         return
     planes = {}
     for name, array in channels.items():
@@ -264,11 +311,11 @@ def _png_ends(path: Path) -> bool:
         return file.read()[4:8] == b"IEND"
 
 
-def _as_pixels(pixels, background) -> NDArray:
+def _as_pixels(pixels, background, tone="none", exposure=0.0, bits=8, dither=False) -> NDArray:
     """Return (h, w, channels) uint8 or uint16 sRGB pixels of a float or integer picture."""
     pixels = np.asarray(pixels)
     if pixels.dtype.kind == "f":
-        return to_srgb8(pixels, background)
+        return to_srgb_bytes(pixels, background, tone, exposure, bits, dither)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
@@ -285,8 +332,11 @@ def _known(path) -> Path:
     return path
 
 
-def _eight_bit(value: NDArray) -> NDArray:
-    return (np.clip(np.nan_to_num(value), 0, 1) * 255 + 0.5).astype(np.uint8)
+def _whole(value: NDArray, bits: int, shift=0.0) -> NDArray:
+    """Return values from 0 to 1 as whole numbers of `bits` bits, rounded after `shift` is added."""
+    most = 2**bits - 1
+    value = np.clip(np.nan_to_num(value), 0, 1) * most
+    return np.clip(value + (np.float32(0.5) + shift), 0, most).astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def _oiio_error(source) -> str:

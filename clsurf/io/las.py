@@ -5,7 +5,6 @@ from pathlib import Path
 
 import laspy
 import lazrs
-import lazrs
 import numpy as np
 from numpy.typing import NDArray
 

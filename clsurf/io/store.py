@@ -17,6 +17,7 @@ from zarr.storage import LocalStore, ZipStore
 
 from clsurf.errors import Error, FileFormatError, InputError
 
+from . import parts
 from .files import existing_file, one_line, replacing
 from .layout import KINDS, from_arrays, to_arrays
 
@@ -44,16 +45,17 @@ def save_store(thing, path) -> None:
             # Attributes are given here: a later update would put a second zarr.json into the zip.
             group = zarr.create_group(store, attributes=attributes)
             for name, array in arrays.items():
-                _create(group, name, array)
+                create_array(group, name, array)
         finally:
             store.close()
 
 
-def _create(group: zarr.Group, name: str, array) -> None:
+def create_array(group: zarr.Group, name: str, array, chunk_bytes: int = _CHUNK_BYTES, codec: str = "zstd") -> None:
+    """Write `array` into a group as its member `name`, in chunks of rows."""
     array = np.ascontiguousarray(array)
     row_bytes = max(1, array.dtype.itemsize * math.prod(array.shape[1:]))
-    rows = min(max(1, _CHUNK_BYTES // row_bytes), max(1, array.shape[0] if array.ndim else 1))
-    shuffled = BloscCodec(typesize=array.dtype.itemsize, cname="zstd", clevel=5, shuffle="bitshuffle")
+    rows = min(max(1, chunk_bytes // row_bytes), max(1, array.shape[0] if array.ndim else 1))
+    shuffled = BloscCodec(typesize=array.dtype.itemsize, cname=codec, clevel=5, shuffle="bitshuffle")
     # Chunks of zeros are written too: a missing chunk is then always a damaged store.
     group.create_array(name, data=array, chunks=(rows, *(max(1, n) for n in array.shape[1:])), compressors=shuffled,
                        serializer=BytesCodec(endian="little"), filters=None, config={"write_empty_chunks": True})
@@ -104,14 +106,22 @@ def _read_group(path: Path, group: zarr.Group, members: "_Members"):
     if version > VERSION:
         raise FileFormatError(f"{path}: written in version {version} of the .clsurf format, this clsurf reads up to "
                               f"version {VERSION}: install a newer clsurf")
+    if kind == parts.KIND:
+        return parts.read_parts(path, group, members)
     if kind not in KINDS:
         raise FileFormatError(f"{path}: holds the unknown kind {kind!r}: expected {', '.join(KINDS)}")
+    return from_arrays(kind, read_arrays(path, group, members), dict(about["values"]))
+
+
+def read_arrays(path: Path, group: zarr.Group, members: "_Members", prefix: str = "") -> dict:
+    """Return all arrays of `group`, whose members' names start with `prefix`, after checking what they declare."""
     # One by one: zarr's concurrent listing of members writes the traceback of a damaged one to the terminal.
-    names = [key.removesuffix("/zarr.json") for key in sorted(members.sizes) if key.endswith("/zarr.json")]
+    keys = [key.removeprefix(prefix) for key in sorted(members.sizes) if key.startswith(prefix)]
+    names = [key.removesuffix("/zarr.json") for key in keys if key.endswith("/zarr.json")]
     found = {name: item for name, item in ((name, group[name]) for name in names) if isinstance(item, zarr.Array)}
     for name, array in found.items():
-        _check_array(path, name, array, members)
-    return from_arrays(kind, {name: np.asarray(array[...]) for name, array in found.items()}, dict(about["values"]))
+        _check_array(path, prefix + name, array, members)
+    return {name: np.asarray(array[...]) for name, array in found.items()}
 
 
 def _check_array(path: Path, name: str, array: zarr.Array, members: "_Members") -> None:

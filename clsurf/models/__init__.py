@@ -7,4 +7,5 @@ from .basic import ellipsoid as ellipsoid
 from .basic import sphere as sphere
 from .basic import torus as torus
 from .earth import earth as earth
+from .meteoroid import meteoroid as meteoroid
 from .perfect_sphere import perfect_sphere as perfect_sphere

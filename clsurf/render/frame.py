@@ -44,15 +44,38 @@ class Frame:
         height, width = next(iter(self.channels.values())).shape[:2]
         return width, height
 
-    def save(self, path: str | PathLike) -> None:
+    def save(self, path: str | PathLike, tone: str = "none", exposure: float = 0.0, bits: int = 8,
+             dither: bool = False) -> None:
         """Write the picture: .png and .jpg the colour (sRGB), .exr every channel (float32, linear, premultiplied).
+
+        Parameters
+        ----------
+        path : path-like
+        tone, exposure, bits, dither
+            See `pixels`; .exr stays linear and takes none of them, 16 bits are for .png only.
 
         Raises
         ------
         InputError
             Another extension, a folder that cannot be written, or no colour where one is needed.
         """
-        images.write_frame(path, self.channels)
+        images.write_frame(path, self.channels, None, tone, exposure, bits, dither)
+
+    def pixels(self, tone: str = "none", exposure: float = 0.0, bits: int = 8, dither: bool = False) -> NDArray:
+        """Return the colour (h, w, 4) as sRGB with straight alpha, uint8 or uint16.
+
+        Parameters
+        ----------
+        tone : str
+            "none": light over 1 is clipped; "reinhard", "aces" or "agx": it is taken into the range by a curve.
+        exposure : float
+            Stops, before the curve: each doubles the light.
+        bits : int
+            8 or 16.
+        dither : bool
+            Hide the steps of slow gradients under an ordered pattern.
+        """
+        return images.to_srgb_bytes(self.color, None, tone, exposure, bits, dither)
 
     def __array__(self, dtype=None, copy=None):
         return np.array(images.to_srgb8(self.color), dtype=dtype)

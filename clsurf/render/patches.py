@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..surface.patch import PatchSurface
-from ..surface.srgb import LINEAR_OF_BYTE, to_linear
+from ..surface.srgb import LINEAR_OF_BYTE, linear_color, to_linear
 from .patch_drawing import PatchDrawing
 from .patch_forms import WIDEST_SPACING_PX, cull_patches, surface_form
 from .patch_lattice import CELLS
@@ -159,7 +159,7 @@ def place_patches(upload: PatchUpload, matrix: NDArray | None, camera, size, sha
     view[22], view[24] = first, 1 / layer
     view[25] = 4095.99 / max(upload.largest_border, 1e-30)
     own = shading.model_colors and upload.color is not None
-    view[26:29] = upload.color if own else to_linear(shading.color)
+    view[26:29] = upload.color if own else linear_color(shading.color)
     return view
 
 
@@ -209,19 +209,21 @@ def shade_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpl
     """
     floats = grid.clip_into(place_patches(upload, matrix, camera, grid.size, look.shading))
     view = device.upload(np.concatenate([floats, whole, lamps]))
-    out = new_channels(device, grid.size, channels)
     lamps = device.upload(lamps) if grid.layout.lit else None
-    _stages(device, scratch, grid, upload, floats, view, look, lamps, 0, out)
-    return out
+    return _stages(device, scratch, grid, upload, floats, view, look, lamps, 0, channels)
 
 
-def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, out=None) -> None:
-    """Run the stages of one surface: project, work at the nodes where a mode asks for it, tile."""
+def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, channels=None) -> dict | None:
+    """Run the stages of one surface: project, work at the nodes where a mode asks for it, tile.
+
+    With `channels` the tiles are shaded into those of a picture, which are returned; else they go into the planes.
+    """
     drawing = look.patches
     form = surface_form(device, upload, upload_patches, floats, drawing)
     whole, levels = (upload, 1) if form is None else (form.upload, form.levels)
     projected = project_patches(device, whole, view, drawing, levels)
     upload = projected.upload
+    out = None if channels is None else new_channels(device, grid.size, channels)  # while the patches are projected
     if drawing.cull and drawing.cells != "smooth":  # the cones hold the normals of facets
         cull_patches(device, upload, whole, levels, projected.levels, view, projected)
     constants = patch_constants(upload)
@@ -238,3 +240,4 @@ def _stages(device, scratch, grid, upload, floats, view, look, lamps, number, ou
     if out is not None:
         constants |= shade_constants(grid, look.shading.look, tuple(out))
     tile_patches(device, scratch, grid, upload, constants, view, projected, number, look, out)
+    return out

@@ -3,6 +3,7 @@
 import os
 import threading
 import weakref
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,12 +16,15 @@ from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
-from .average import average, checked_supersampling, fine_channels
+from .average import average, fine_channels
+from .backdrop import checked_background, lay_over
 from .camera import Camera
 from .clip import checked_clip, view_clip
+from .coverage import FACTOR, checked_antialias, cover_edges, edge_channels, edge_layout, mark_edges
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .eye_dome import eye_dome
 from .frame import Frame
+from .lighting import OWN_COLORS, prepared_lighting, surface_shading, wants_lighting
 from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
 from .mirror import reflect, wants_mirror
@@ -31,14 +35,14 @@ from .point_drawing import PointDrawing
 from .points import draw_points, is_unlit, upload_cloud
 from .scale_map import draw_scale_map, upload_scale_map
 from .scale_map_drawing import ScaleMapDrawing
-from .scene import as_scene, without_points
+from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
 from .surfel_drawing import SurfelDrawing
 from .surfels import draw_surfels, upload_surfels
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
-from .traced_light import light_grid, wants_traced_light
+from .traced_light import light_grid
 
 # How each kind of surface is put on the device, and drawn into a grid.
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
@@ -89,7 +93,8 @@ class Renderer:
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
                slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
-               scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None, clip=None) -> Frame:
+               scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None, clip=None,
+               antialias: str = "none") -> Frame:
         """Draw a scene.
 
         Parameters
@@ -114,8 +119,10 @@ class Renderer:
         lod : float
             Surfels that appear up to this many pixels wide are drawn in place of the finer ones below them: 4 is safe,
             8 a fast mode that shows, 0 draws the leaves only.
-        background : 3 or 4 floats
-            sRGB with straight alpha, 0 to 1.
+        background : 3 or 4 floats, two of those, str, path, array or Light
+            A colour, sRGB with straight alpha, 0 to 1; two: a gradient from top to bottom; "transparent"; "sky": the
+            scene's image light itself (orthographic cameras see one place of it); an image light that need not be in
+            the scene; a picture, file or array (h, w, 3), that fills the frame.
         supersampling : int
             1 to 4: samples along each side of a pixel. The picture is drawn that much larger, so thresholds in pixels
             count samples; "color" is the mean, every other channel that of the sample at the pixel's centre, or, for 2
@@ -133,6 +140,10 @@ class Renderer:
         clip : (4,) or (n, 4) array_like, optional
             Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
             that the inside is seen. What is cut off still throws shadows and is seen in mirrors.
+        antialias : str
+            "none"; "coverage": the colour of pixels at edges, of outlines, depth, surfaces and creases, is the mean of
+            4 x 4 samples, that of all others one sample's, a fraction of the work of "supersample", which is
+            ``supersampling=4``.
 
         Returns
         -------
@@ -150,7 +161,7 @@ class Renderer:
         if self.device.process != os.getpid():
             raise DeviceError("renderer: it was made before this process was forked: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
-        factor, clip = checked_supersampling(supersampling), checked_clip(clip)
+        (factor, covered), clip = checked_antialias(antialias, supersampling), checked_clip(clip)
         picture, size = size, checked_size([n * factor for n in size])
         asked, channels = channels, fine_channels(channels, factor)
         curved = wanted_differentials(channels)
@@ -158,7 +169,11 @@ class Renderer:
         shading = DEFAULT_SHADING if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
         if not isinstance(shading, Shading):
             raise InputError(f"shading: expected a clsurf.Shading or the name of a look, got {shading!r}")
-        if wants_mirror(shading, channels):
+        covered = covered and "color" in channels
+        if covered:
+            channels = edge_channels(channels, len(scene.surfaces))
+        back = checked_background(background, scene)
+        if wants_mirror(scene, shading, channels):
             channels = list(dict.fromkeys([*channels, *MIRROR_CHANNELS]))
         patches = DEFAULT_PATCHES if patches is None else patches
         if not isinstance(patches, PatchDrawing):
@@ -183,63 +198,81 @@ class Renderer:
         try:
             # The stages of a frame.
             placed, origin = scene.placed, scene_origin(scene)
-            traced = wants_traced_light(shading, channels)
-            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not traced
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, points,
-                                  view_clip(clip, camera), planes=not at_once)
-            floats = shading_floats(shading, scene.lights, background, camera)
+            early = wants_lighting(scene, shading, channels)
+            mirrored, lighting = wants_mirror(scene, shading, channels), None
+            if early or covered or mirrored:
+                lighting = prepared_lighting(self.device, scene, shading, camera)
+            if lighting and len(lighting.materials) > 1:
+                channels = list(dict.fromkeys([*channels, "id"]))
+            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not early
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, points, view_clip(clip, camera),
+                                  early, at_once, lighting)
+            floats = shading_floats(shading, scene.lights, back.color, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
+            lamps = None if at_once and not covered else self.device.upload(floats)
+            look = Look(shading, lod, patches, slim, surfels, scale_map, lamps, "cost" in channels, points)
             if at_once:
-                (surface, matrix), look = placed[0], Look(shading, lod, patches, slim)
+                (surface, matrix), = placed
                 arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
                                        whole, floats, channels)
             else:
-                lamps = self.device.upload(floats)
-                look = Look(shading, lod, patches, slim, surfels, scale_map, lamps, "cost" in channels, points)
-                for number, (surface, matrix) in enumerate(placed):
-                    KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            look, number)
-                if grid.layout.unlit and points.eye_dome is not False:
-                    eye_dome(self.device, self._scratch, grid, points, camera, factor)
-                if traced:
-                    light_grid(self.device, self._scratch, grid, without_points(scene), camera, shading, floats,
-                               lamps)
-                arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
-                               shading.look, channels)
-            if wants_mirror(shading, channels):
-                reflect(self.device, scene, camera, shading, floats[8:12], origin, arrays)
+                self._draw(grid, scene, camera, look, floats, lighting if early else None, factor)
+                arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), look.lamps,
+                               "phong" if early else shading.look, channels)
+            if covered:
+                edges, large = mark_edges(self.device, self._scratch, grid, self.device.upload(whole), arrays,
+                                          edge_layout(grid.layout, len(lighting.materials)))
+                self._draw(large, scene, camera, replace(look, lod=FACTOR * lod, cost=False), floats, lighting, FACTOR)
+                cover_edges(self.device, large, edges, self.device.upload(floats[8:12]), arrays["color"])
+            if mirrored:
+                reflect(self.device, scene, camera, shading, back, origin, floats, lighting, arrays)
             if factor > 1:
                 arrays = average(self.device, arrays, picture, factor, wanted, curved, self._scratch.lanes)
+            if "color" in wanted:
+                lay_over(self.device, back, camera, picture, arrays["color"], self._scratch.lanes)
             arrays = self.device.download_all(arrays)
             arrays |= split_differentials(arrays.pop(NAME), curved) if curved else {}
             return Frame({name: arrays[name] for name in asked}, origin, camera)
         finally:
             self.device.profile = own_profile
 
+    def _draw(self, grid: Grid, scene, camera, look: Look, floats, lighting, factor: int) -> None:
+        """Draw all surfaces of a scene into a grid's planes; light them there where `lighting` says how.
+
+        `factor`: samples of the grid along a side of a pixel.
+        """
+        for number, (surface, matrix) in enumerate(scene.placed):
+            own = surface_shading(scene, look.shading, number)
+            KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
+                                    look if own is look.shading else replace(look, shading=own), number)
+        if grid.layout.unlit and look.points.eye_dome is not False:
+            eye_dome(self.device, self._scratch, grid, look.points, camera, factor)
+        if lighting is not None:
+            light_grid(self.device, self._scratch, grid, scene, camera, look.shading, floats, look.lamps, lighting)
+
     def _framing(self, scene, size) -> Camera:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, points, clip, planes: bool) -> Grid:
-        """Return bins that nothing has touched yet; without `planes` only their places."""
+    def _new_grid(self, placed, size, channels, curved, shading, patches, points, clip, early: bool, at_once: bool,
+                  lighting) -> Grid:
+        """Return bins that nothing has touched yet; `at_once`: only their places."""
         colored = shading.model_colors and any(carries_colors(s) for s, _ in placed)
         colored |= shading.look.startswith("ball") or points.attribute is not None
         unlit = any(is_unlit(s, points, shading) for s, _ in placed)
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
-        lit &= any(isinstance(s, PatchSurface) for s, _ in placed)
-        traced = wants_traced_light(shading, channels)
-        layout = Layout(color=(colored or lit or traced or unlit) and "color" in channels, id="id" in channels,
-                        count="count" in channels, level="level" in channels, lit=lit, traced=traced,
-                        clip_planes=len(clip), unlit=unlit and "color" in channels,
-                        differentials=curved)
+        lit &= any(isinstance(s, PatchSurface) for s, _ in placed) and (lighting is None or lighting.plain)
+        layout = Layout(color=(colored or lit or early or unlit) and "color" in channels, id="id" in channels,
+                        count="count" in channels, level="level" in channels, lit=lit, traced=early,
+                        clip_planes=len(clip), unlit=unlit and "color" in channels, differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
-        self.device.check_memory(planes=4 * 64 * fields * bins * planes,
+        self.device.check_memory(planes=4 * 64 * fields * bins * (not at_once),
                                  differentials=4 * layout.differential_planes * pixels,
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
         patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
-        if not planes:
+        if at_once:
             return Grid(size, self.tile_bins, layout, None, None, patch_bins, clip)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
@@ -274,7 +307,7 @@ def carries_colors(surface) -> bool:
     """Return whether a surface or a scan has colours of its own."""
     if isinstance(surface, RangeScan):
         return all(image.color is not None for image in surface.images)
-    return any(getattr(surface, name, None) is not None for name in ("colors", "color", "texture"))
+    return any(getattr(surface, name, None) is not None for name in OWN_COLORS)
 
 
 def scene_origin(scene) -> np.ndarray:
@@ -318,14 +351,15 @@ def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 7
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
            patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
-           scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None,
-           clip=None) -> Frame:
+           scale_map: ScaleMapDrawing | None = None, points: PointDrawing | None = None, clip=None,
+           antialias: str = "none") -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim, surfels, scale_map, points, clip)
+                                                supersampling, patches, slim, surfels, scale_map, points, clip,
+                                                antialias)
 
 
 _shared = threading.local()

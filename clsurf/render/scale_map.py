@@ -224,8 +224,8 @@ def draw_scale_map(device: Device, scratch: Scratch, grid: Grid, upload: ScaleMa
     """Run all stages of one placed map: nodes (kept), project, bin, tile."""
     cells = cells_of(device, upload, look.scale_map)
     floats, cull = place_scale_map(upload, matrix, camera, grid.size, look.shading.color)
-    view = device.upload(floats)
-    records, footprints = project_cells(device, scratch, cells, view, cull)
+    view = device.upload(grid.clip_into(floats))
+    records, footprints = project_cells(device, scratch, cells, view, cull and not grid.layout.clip_planes)
     pairs = bin_pairs(device, scratch, grid, footprints, cells.blocks)
     if pairs is not None:
         tile_cells(device, scratch, grid, cells, view, records, pairs, number)

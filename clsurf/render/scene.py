@@ -14,7 +14,8 @@ from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
-from .shade import Light
+from .light import Light
+from .material import Material, checked_materials
 
 DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, PointCloud, RangeScan)
 
@@ -29,21 +30,28 @@ class Scene:
         Place a surface with ``surface.moved(matrix)``. The number in the list is the channel "id".
     lights : list of Light, optional
         By default one headlight.
+    materials : Material, or list of Material or None, optional
+        Of all surfaces, or of each; a surface without one looks as the `Shading` of the picture says.
 
     Raises
     ------
     InputError
-        Something that cannot be drawn.
+        Something that cannot be drawn, lights that are none, or another number of materials than of surfaces.
     """
 
     surfaces: tuple
     lights: tuple[Light, ...] = (Light(),)
+    materials: Material | tuple[Material | None, ...] | None = None
 
     def __post_init__(self):
         if not isinstance(self.surfaces, list | tuple):
             raise InputError(f"scene: expected a list of surfaces, got a {type(self.surfaces).__name__}")
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
-        object.__setattr__(self, "lights", tuple(self.lights))
+        object.__setattr__(self, "lights", (self.lights,) if isinstance(self.lights, Light) else tuple(self.lights))
+        wrong = next((light for light in self.lights if not isinstance(light, Light)), None)
+        if wrong is not None:
+            raise InputError(f"scene lights: expected clsurf.Light objects, got {wrong!r}")
+        checked_materials(self.materials, len(self.surfaces))
         for i, surface in enumerate(self.surfaces):
             own = surface.surface if isinstance(surface, Placed) else surface
             if not isinstance(own, DRAWABLE):
@@ -53,6 +61,11 @@ class Scene:
 
     def __repr__(self):
         return f"Scene({len(self.surfaces)} surfaces, {len(self.lights)} lights)"
+
+    @property
+    def surface_materials(self) -> tuple[Material | None, ...]:
+        """The material of each surface, None for the shading's."""
+        return checked_materials(self.materials, len(self.surfaces))
 
     @property
     def placed(self) -> list[tuple[object, NDArray | None]]:
@@ -66,12 +79,6 @@ class Scene:
         if not boxes:
             return np.full((2, 3), np.nan)
         return np.stack([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
-
-
-def without_points(scene: Scene) -> Scene:
-    """Return the scene without its points, which no ray can meet."""
-    kept = [s for s in scene.surfaces if not isinstance(getattr(s, "surface", s), PointCloud | RangeScan)]
-    return scene if len(kept) == len(scene.surfaces) else Scene(kept, scene.lights)
 
 
 def as_scene(thing) -> Scene:

@@ -1,13 +1,20 @@
-"""Shading: material, lights, background, and the last stage, which writes the channels of the picture."""
+"""Shading: how all surfaces look, the background, and the last stage, which writes the channels of the picture."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
+from os import PathLike
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
-from ..surface.srgb import to_linear
+from ..surface.srgb import linear_color
 from .differentials import NAME
+from .light import LIGHT_FLOATS, checked_numbers, light_floats
+from .light import Light as Light
+from .material import LOOKS as MATERIAL_LOOKS
+from .material import check_looks
 from .patch_drawing import PatchDrawing
 from .point_drawing import PointDrawing
 from .scale_map_drawing import ScaleMapDrawing
@@ -17,70 +24,54 @@ from .tiles import BIN, Grid, Scratch
 
 CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np.float32), "position": (3, np.float32),
             "id": (0, np.int32), "count": (0, np.int32), "level": (0, np.int32), "cost": (0, np.int32)}
-KINDS = {"headlight": 0, "directional": 1, "point": 2}
-LOOKS = ("phong", "flat", "reflection", "ball_size", "ball_level")
+LOOKS = (*MATERIAL_LOOKS, "ball_size", "ball_level")
+HEAD_FLOATS = 16  # of the shading buffer, before its lamps
 STREAMED_BYTES = 8 << 20  # pictures larger than this are stored past the caches
 SPAN = 128  # pixels of a row of bins that one work-item shades
 
 
-@dataclass(frozen=True)
-class Light:
-    """A light.
-
-    Parameters
-    ----------
-    kind : str
-        "headlight" (at the eye), "directional" or "point".
-    vector : (3,) float
-        Directional: from the surface to the light, world space. Point: its position, world space.
-    color : (3,) float
-        Linear red, green, blue; 1 lights a white surface fully.
-    """
-
-    kind: str = "headlight"
-    vector: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-    def __post_init__(self):
-        if self.kind not in KINDS:
-            raise InputError(f"light kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
-        if np.shape(self.vector) != (3,) or np.shape(self.color) != (3,):
-            raise InputError("light: expected a vector and a color of 3 numbers each")
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shading:
-    """How surfaces look.
+    """How surfaces look; `Scene(materials=)` says it for each by itself.
 
     Parameters
     ----------
     look : str
-        "phong"; "flat": colours without light; "reflection": reflection lines, level lines of the mirrored direction
-        to the eye that run across the picture (paper, figures 2 and 17; use supersampling); "ball_size",
-        "ball_level": the surfels' balls coloured by size or by level (paper, figures 1 and 7).
+        "phong"; "physical", "matcap", "normal": see `Material`; "flat": colours without light; "reflection":
+        reflection lines, level lines of the mirrored direction to the eye that run across the picture (paper,
+        figures 2 and 17; use supersampling); "ball_size", "ball_level": the surfels' balls coloured by size or by
+        level (paper, figures 1 and 7), whatever the surfaces' materials.
     level : int, optional
         With "ball_level": draw the surface as it is built up to this level, the leaves up to there pink and the
         level's internal surfels blue (figure 7); None draws the chosen surfels, coloured by level.
     color : (3,) float
         sRGB colour, 0 to 1, of surfaces that have none.
-    ambient, diffuse, specular : float
+    ambient : float
+        Light from all sides, where the scene has no image light.
+    diffuse, specular : float
     shininess : int
         Exponent of the highlight (Blinn-Phong).
     model_colors : bool
         Use the colours that a surface carries.
     stripes : float
         With "reflection": dark lines on a sphere.
+    metallic, roughness : float
+        With "physical"; see `Material`.
+    matcap : str, path or array
+        With "matcap"; see `Material`.
     shadows : bool
-        With "phong": the scene's lights throw hard shadows, but for a headlight, which has none. All surfaces throw
-        and receive them (patches that `PatchDrawing` lights at their nodes receive none).
+        With "phong" and "physical": the scene's lights throw hard shadows, but for a headlight, which has none, and an
+        image, whose shadows are its occlusion. All surfaces throw and receive them (patches that `PatchDrawing` lights
+        at their nodes receive none).
     occlusion : int
-        With "phong": directions above a surface along which ambient occlusion looks for SLIM surfaces (32 to 256); the
-        part of them that is open multiplies `ambient`, so give that more weight. 0: none.
+        With "phong" and "physical": directions above a surface along which ambient occlusion looks for SLIM surfaces
+        (32 to 256); what an image light sends along those that are open is the part of its light that is seen,
+        without one their part multiplies `ambient`, so give that more weight. 0: none.
     occlusion_reach : float, optional
         How far ambient occlusion looks, world units; by default a quarter of the scene's diagonal.
     mirror : float or sequence of float
-        With "phong": the share, 0 to 1, of mirror reflection (one bounce) in the colour of all surfaces, or of each
-        surface of the scene in turn.
+        With "phong" and "physical": the share, 0 to 1, of mirror reflection (one bounce) in the colour of all surfaces,
+        or of each surface of the scene in turn.
     """
 
     look: str = "phong"
@@ -96,36 +87,25 @@ class Shading:
     occlusion: int = 0
     occlusion_reach: float | None = None
     mirror: float | tuple[float, ...] = 0.0
+    metallic: float = 0.0
+    roughness: float = 0.5
+    matcap: str | PathLike | NDArray = "clay"
 
     def __post_init__(self):
         if self.look not in LOOKS:
             raise InputError(f"shading look: expected one of {', '.join(LOOKS)}, got {self.look!r}")
-        checks = [("color", 3), ("ambient", 0), ("diffuse", 0), ("specular", 0), ("shininess", 0), ("stripes", 0)]
-        for name, count in checks:
-            _checked_numbers(name, getattr(self, name), count)
-        if self.shininess != int(self.shininess) or not 0 <= self.shininess <= 4096:
-            raise InputError(f"shading shininess: expected a whole number from 0 to 4096, got {self.shininess}")
-        if not 0 < self.stripes <= 4096:
-            raise InputError(f"shading stripes: expected a number over 0, at most 4096, got {self.stripes}")
+        checked_numbers("shading color", self.color, 3)
+        checked_numbers("shading ambient", self.ambient, 0)
+        check_looks("shading", self)
         if not isinstance(self.occlusion, int | np.integer) or not 0 <= self.occlusion <= 1024:
             raise InputError("shading occlusion: expected a whole number of directions from 0 to 1024, got "
                              f"{self.occlusion!r}")
         if self.occlusion_reach is not None:
-            _checked_numbers("occlusion_reach", self.occlusion_reach, 0)
+            checked_numbers("shading occlusion_reach", self.occlusion_reach, 0)
         shares = np.asarray(self.mirror)
         if shares.ndim > 1 or shares.dtype.kind not in "fiu" or not ((shares >= 0) & (shares <= 1)).all():
             raise InputError("shading mirror: expected a share from 0 to 1, or one for each surface, got "
                              f"{self.mirror!r}")
-
-
-def _checked_numbers(name, value, count) -> None:
-    """Raise InputError unless `value` is `count` finite numbers (0: one number)."""
-    try:
-        wrong = np.shape(value) != ((count,) if count else ()) or not np.isfinite(np.asarray(value, np.float64)).all()
-    except (TypeError, ValueError):
-        wrong = True
-    if wrong:
-        raise InputError(f"shading {name}: expected {f'{count} numbers' if count else 'a number'}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -146,24 +126,35 @@ class Look:
 def shading_floats(shading: Shading, lights, background, camera) -> np.ndarray:
     """Return the shading buffer of kernels/render/shade.cl; positions and directions in view space.
 
-    `background` is sRGB with straight alpha, 3 or 4 values from 0 to 1.
+    `background` is sRGB with straight alpha, 3 or 4 values from 0 to 1. The result is read-only: under headlights alone
+    it does not depend on the camera and is looked up.
     """
+    if all(light.kind == "headlight" for light in lights):
+        try:
+            return _same_light(shading, tuple(lights), tuple(background))
+        except TypeError:  # a list among them
+            pass
+    return _shading_floats(shading, lights, background, camera)
+
+
+@lru_cache(maxsize=64)
+def _same_light(shading, lights, background):
+    return _shading_floats(shading, lights, background, None)
+
+
+def _shading_floats(shading, lights, background, camera):
     back = np.asarray(background, np.float64)
     if back.shape not in ((3,), (4,)) or not np.isfinite(back).all():
         raise InputError(f"background: expected 3 or 4 numbers from 0 to 1 (sRGB, alpha), got {background}")
     alpha = back[3] if len(back) == 4 else 1.0
-    out = np.zeros(16 + 8 * len(lights), np.float32)
-    out[0:3] = to_linear(shading.color)
+    lamps = light_floats(lights, camera)
+    out = np.zeros(HEAD_FLOATS + LIGHT_FLOATS * len(lamps), np.float32)
+    out[0:3] = linear_color(shading.color)
     out[3:8] = shading.ambient, shading.diffuse, shading.specular, shading.shininess, shading.stripes
-    out[8:11], out[11] = to_linear(back[:3]) * alpha, alpha
-    out[12] = len(lights)
-    for i, light in enumerate(lights):
-        vector = np.asarray(light.vector, np.float64)
-        if light.kind == "directional":
-            vector = camera.rotation @ vector / max(np.linalg.norm(vector), 1e-300)
-        elif light.kind == "point":
-            vector = camera.rotation @ (vector - camera.eye)
-        out[16 + 8 * i:24 + 8 * i] = KINDS[light.kind], *vector, *light.color, 0
+    out[8:11], out[11] = linear_color(back[:3]) * alpha, alpha
+    out[12] = len(lamps)
+    out[HEAD_FLOATS:] = lamps.ravel()
+    out.flags.writeable = False
     return out
 
 

@@ -216,7 +216,7 @@ def draw_surfels(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpl
     drawing = look.surfels
     interior, lod = (drawing.interior, min(look.lod, drawing.interior))
     floats = place_surfels(upload, matrix, camera, grid.size, lod)
-    view = device.upload(floats)
+    view = device.upload(grid.clip_into(floats))
     state = select_surfels(device, scratch, upload, view, interior if lod > 0 else 0.0)
     drawn = np.flatnonzero(state == DRAWN).astype(np.int32)
     if upload.triangles is not None:

@@ -6,6 +6,7 @@ bin) with `bin_pairs` and writes the same planes, so that surfaces of all kinds 
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class Layout:
         scalars, vectors = plane_counts(self.differentials)
         return scalars + 3 * vectors
 
-    @property
+    @cached_property
     def constants(self) -> dict[str, int]:
         """``FIELDS`` and ``FIELD_X`` as the kernels want them (kernels/common/planes.clh)."""
         out, at = {}, 4
@@ -49,7 +50,7 @@ class Layout:
         if self.differentials:
             out |= field_constants(self.differentials, at)
             at += self.differential_planes
-        lit = self.lit or self.traced or self.unlit
+        lit = 2 if self.traced else int(self.lit or self.unlit)
         return out | {"FIELDS": at, "LIT_COLORS": lit, "CLIP_PLANES": self.clip_planes}
 
 
@@ -64,6 +65,7 @@ class Grid:
     planes: DeviceArray | None  # (bins, FIELDS, 64) float32; None where the picture is shaded without them
     patch_bins: int = 4  # bins across a tile of patches
     clip: NDArray | None = None  # (n, 4) float64: clip planes, view space
+    masked: bool = False  # whether `touched` is -2 where a bin is not wanted: stages may leave it out
 
     def clip_into(self, view: NDArray) -> NDArray:
         """Write the clip planes into a view buffer (VIEW_FLOATS,) float32 and return it."""
@@ -188,16 +190,18 @@ def bin_pairs(device: Device, scratch: "Scratch", grid: Grid, footprints: Footpr
     device.check_memory(bin_counts=4 * bins * parts, bin_offsets=8 * (bins + 1))
     counts = scratch.array("bin_counts", (parts, bins), np.uint32)
     offsets = scratch.array("bin_offsets", (bins + 1,), np.uint32)
-    device.kernel("render/count_bins.cl")((parts,), None, order, depth_offsets, footprints.full, parts, grid.bins_x,
-                                          bins, counts)
+    masked, touched = {"MASKED": int(grid.masked)}, grid.touched if grid.masked else offsets
+    device.kernel("render/count_bins.cl", constants=masked)(
+        (parts,), None, order, depth_offsets, footprints.full, parts, grid.bins_x, bins, touched, counts)
     scan(device, counts, parts, bins, scratch.array("bin_totals", (bins,), np.uint32), offsets)
     total = int(device.download(offsets, copy=False)[-1])
     if total == 0:
         return None
     device.check_memory(pairs=8 * total)
     pairs = scratch.array("pairs", (total, 2), np.uint32)
-    device.kernel("render/fill_bins.cl")((parts,), None, order, depth_offsets, footprints.full, footprints.core,
-                                         footprints.keys, parts, grid.bins_x, bins, counts, offsets, pairs)
+    device.kernel("render/fill_bins.cl", constants=masked)(
+        (parts,), None, order, depth_offsets, footprints.full, footprints.core, footprints.keys, parts, grid.bins_x,
+        bins, touched, counts, offsets, pairs)
     return PairLists(offsets, pairs, total)
 
 

@@ -107,7 +107,7 @@ def project_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: T
         (runs,), (16,), view, points, triangles.faces, faces, runs, touch.full, touch.core, touch.keys, touch.buckets)
     # In a grid whose bins are the tiles.
     tiles = [-(-n // grid.patch_bins) for n in (grid.bins_x, grid.bins_y)]
-    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN))
+    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN), masked=False)
     return points, touch.core, bin_pairs(device, scratch, coarse, touch, runs)
 
 
@@ -134,7 +134,7 @@ def draw_triangles(device: Device, scratch: Scratch, grid: Grid, triangles: Tria
         colors = triangles.uv if texture is not None else triangles.colors
     constants = grid.layout.constants | {
         "VW": scratch.lanes, "TILE_BINS": grid.patch_bins, "HAS_NORMALS": triangles.normals is not None,
-        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost,
+        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost, "MASKED": int(grid.masked),
         "TEXTURED": texture is not None}
     texels = (view, view, 0, view) if texture is None else (texture.texels, texture.levels, len(texture.levels),
                                                             texture.linear)

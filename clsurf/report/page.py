@@ -21,13 +21,18 @@ from ..render.scene import Scene, as_scene
 from ..render.tiles import BIN
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .charts import bars
+from .scale_map import scale_map_sections
 from .sections import Section, View, patch_sections, slim_sections, table
 from .style import PAGE
+from .surfels import surfel_sections
 
 # What a report says of a surface, by its kind: a function from (surface or placed surface, view, number) to sections.
-SECTIONS: dict[type, Callable[..., list[Section]]] = {PatchSurface: patch_sections, SlimSurface: slim_sections}
+SECTIONS: dict[type, Callable[..., list[Section]]] = {PatchSurface: patch_sections, SlimSurface: slim_sections,
+                                                       SurfelHierarchy: surfel_sections, ScaleMap: scale_map_sections}
 CHANNELS = ("color", "depth", "id", "count", "level", "cost")
 FRAMES = 9  # drawn for the times, after one that compiles the kernels and uploads the surfaces
 

@@ -1,5 +1,7 @@
 """sRGB and linear light: the one home of the curve (IEC 61966-2-1) and of what files' bytes mean."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,18 @@ def to_linear(srgb) -> NDArray:
     """Return the linear light, float64, of sRGB values from 0 to 1."""
     srgb = np.asarray(srgb, np.float64)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def linear_color(srgb) -> NDArray:
+    """Return the linear light of a colour, read-only; those that came before are looked up: 3 a frame, 10 us each."""
+    return _linear_color(tuple(map(float, srgb)))
+
+
+@lru_cache(maxsize=1024)
+def _linear_color(srgb):
+    out = to_linear(srgb)
+    out.flags.writeable = False
+    return out
 
 
 def to_srgb(linear) -> NDArray:

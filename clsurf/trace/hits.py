@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
 from . import ray_scale_map, ray_slim, ray_surfels, ray_triangles  # noqa: F401  they register their kinds
+from .grids import grid_of, grid_view, trace_grid
 from .kinds import ANY, CLOSEST, NEXT, traced
 from .single import (
     HIT_FLOATS,
@@ -109,19 +110,36 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
     rays = checked_rays(origins, directions, near, far)
     parts = [(number, *part) for number, part in enumerate(parts_of(thing))]
     # All surfaces are put on the device, and refused, before the first ray.
-    parts = [(number, held, placement(held, matrix)) for number, surface, matrix in parts
+    parts = [(number, held, placement(held, matrix), matrix) for number, surface, matrix in parts
              for held in [traced(opened, surface)] if not held.empty]
     tracer = _All(opened, rays) if query == "all" else _Nearest(opened, rays, QUERIES[query])
+    by_packets, parts = picture_parts(opened, rays, parts) if query != "all" else ([], [part[:3] for part in parts])
     for start in range(0, rays.count, SLAB):
         stop = min(start + SLAB, rays.count)
-        tracer.open(start, stop, empty=not parts)
+        tracer.open(start, stop, empty=not parts and not by_packets)
+        for i, (number, hits, place) in enumerate(by_packets):
+            tracer.merge(number, place, hits, start, stop - start, fresh=i == 0)
         for first in range(start, stop, CHUNK):
             for i, (number, held, place) in enumerate(parts):
-                tracer.run(number, held, place, first, min(CHUNK, stop - first), fresh=i == 0)
+                tracer.run(number, held, place, first, min(CHUNK, stop - first), fresh=i == 0 and not by_packets)
             if progress is not None and progress("trace", min(first + CHUNK, stop) / rays.count) is False:
                 raise Cancelled("trace: stopped")
         tracer.close(start, stop)
     return tracer.result()
+
+
+def picture_parts(device: Device, rays: "Rays", parts: list) -> tuple[list, list]:
+    """Trace the parts that packets can, where the rays are those of a picture; return their hits, and other parts."""
+    few = [part for part in parts if part[1].packets is not None] if rays.count <= SLAB and has_doubles(device) else []
+    grid = grid_of(device, rays) if few else None
+    done, left = [], []
+    for number, held, place, matrix in parts:
+        view = grid_view(grid, held, matrix) if grid is not None and held.packets is not None else None
+        if view is None:
+            left.append((number, held, place))
+        else:
+            done.append((number, trace_grid(device, grid, held, view), place))
+    return done, left
 
 
 def parts_of(thing) -> list[tuple[object, NDArray | None]]:
@@ -236,6 +254,14 @@ class _Nearest:
         device.kernel("trace/finish_rays.cl")((count,), (64,), count, at, *self.arguments[:4], on_device, self.starts,
                                               hits, number, int(fresh), *self.out)
         return None
+
+    def merge(self, number: int, place: NDArray, hits, first: int, count: int, fresh: bool) -> None:
+        """Take the hits (count, 8) of rays from ray `first` on, counted from the rays' origins."""
+        device = self.device
+        starts = device.empty((count,), np.float64)
+        device.fill(starts, 0.0)
+        device.kernel("trace/finish_rays.cl")((count,), (64,), count, first - self.start, *self.arguments[:4],
+                                              device.upload(place), starts, hits, number, int(fresh), *self.out)
 
     def _run_host(self, number, held, place, first, count) -> None:
         device, hits = self.device, self.on_device[1]

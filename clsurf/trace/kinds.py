@@ -12,7 +12,7 @@ from ..device import Device, DeviceArray
 from ..errors import InputError
 
 CLOSEST, ANY, NEXT = 0, 1, 2  # kernels/trace/ray_walk.clh, MODE
-RAYS_OF_ITEM = 64  # rays that one work-item of a CPU device traces
+RAYS_OF_ITEM = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +30,30 @@ class Traced:
     launch : function
         ``launch(mode, count, rays, hits)`` enqueues the kernel that fills hits (count, 8) from rays (count, 8), both
         float32 and in the frame (kernels/trace/ray_walk.clh).
+    grain : float
+        Model length within which the surface's own points, as drawn, are no obstacles to rays that leave it; by default
+        a thousandth of the box's diagonal.
+    packets : TracedSlim, optional
+        What packets trace in place of single rays (clsurf/trace/packets.py), for kinds that have them.
+    order : (slots,) int32, optional
+        Primitive of each slot of the packets' tree.
+    colors : function, optional
+        Linear colours (n, 3) float64 of primitives (n,), as `Hits.primitive` numbers them.
     """
 
     center: NDArray
     unit: float
     box: NDArray
     launch: Callable[[int, int, DeviceArray, DeviceArray], None]
+    grain: float | None = None
+    packets: object | None = None
+    order: DeviceArray | None = None
+    colors: Callable[[NDArray], NDArray] | None = None
+
+    def __post_init__(self):
+        if self.grain is None or not np.isfinite(self.grain):
+            diagonal = 0.0 if self.empty else float(np.linalg.norm(self.box[1] - self.box[0]))
+            object.__setattr__(self, "grain", 1e-3 * self.unit * diagonal)
 
     @property
     def empty(self) -> bool:
@@ -53,6 +71,11 @@ def register(kind: type):
         KINDS[kind] = prepare
         return prepare
     return enter
+
+
+def traceable(surface) -> bool:
+    """Return whether rays can meet `surface`: points, which have no extent, cannot be hit."""
+    return any(kind in KINDS for kind in type(surface).__mro__)
 
 
 def items(device: Device, count: int) -> tuple[tuple, tuple, int]:

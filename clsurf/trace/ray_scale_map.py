@@ -43,7 +43,7 @@ def trace_scale_map(device: Device, surface: ScaleMap) -> Traced:
     if not len(kept):
         return Traced(surface.center, surface.radius, NOTHING, lambda *_: None)
     low, high = _boxes(points[kept], size, float(np.nanmax(heights)))
-    tree = plant(low, high)
+    tree = plant(device, low, high)
     number = np.arange(len(heights))
     grid, row, column = number // blocks_side**2, number // blocks_side % blocks_side, number % blocks_side
     rows = np.zeros((len(heights), BLOCK_FLOATS), np.float32)
@@ -57,7 +57,8 @@ def trace_scale_map(device: Device, surface: ScaleMap) -> Traced:
             group_size, group, count, batch, size, tree.roots, tree.first_bottom, *arrays, rays, hits)
 
     box = np.stack([low.min(axis=0), high.max(axis=0)])
-    return Traced(surface.center, surface.radius, box + 1e-4 * np.array([[-1.0], [1.0]]), launch)
+    return Traced(surface.center, surface.radius, box + 1e-4 * np.array([[-1.0], [1.0]]), launch,
+                  2 * surface.radius / surface.size)
 
 
 def _boxes(points, size, largest):

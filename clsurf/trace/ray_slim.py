@@ -1,12 +1,13 @@
-"""SLIM surfaces for single rays: leaves in blocks of 16, one lane each. Kernel: kernels/trace/ray_slim.cl."""
+"""SLIM surfaces for single rays: a record for each leaf. Kernel: kernels/trace/ray_slim.cl."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device import Device
+from ..device import Device, DeviceArray
 from ..surface.slim import COEFFICIENTS, SlimSurface
+from ..surface.srgb import LINEAR_OF_BYTE
 from .kinds import NOTHING, Traced, items, register
-from .slim import kept_traced
+from .slim import TracedSlim, kept_traced
 from .tree import EMPTY, WIDTH, Tree
 
 FAR = 1e15  # where the ball of an empty slot lies
@@ -14,36 +15,47 @@ FAR = 1e15  # where the ball of an empty slot lies
 
 @register(SlimSurface)
 def trace_slim(device: Device, surface: SlimSurface) -> Traced:
-    """Put the leaves on the device; the frame is the model's, relative to its origin."""
+    """Put the leaves on the device; the frame is the model's, relative to its origin. Shadows take packets alone."""
     base = kept_traced(device, surface)
-    tree, count = base.tree, COEFFICIENTS[surface.degree]
-    if not (tree.order >= 0).any():
+    if not (base.tree.order >= 0).any():
         return Traced(surface.origin, 1.0, NOTHING, lambda *_: None)
-    planes = device.download(base.surfels)  # x y z r r, normal, low high slope, coefficients
-    empty = tree.order.reshape(-1, WIDTH) < 0
-    z = planes[:, 7].astype(np.float64)
-    turn = -1 / (np.copysign(1.0, z) + z)
-    blocks = np.concatenate([planes[:, :3], planes[:, 5:8], turn[:, None], 1 / planes[:, 3:4], planes[:, 3:4],
-                             planes[:, 11:11 + count]], axis=1).astype(np.float32)
-    blocks[:, :3] = np.where(empty[:, None], FAR, blocks[:, :3])
-    feet = np.ascontiguousarray(device.download(base.tails)[:, 8:10]).view(np.uint32)
-    feet = np.ascontiguousarray(feet.reshape(-1, WIDTH, 2).transpose(0, 2, 1))
-    limited = (feet != 0xFFFFFFFF).any(axis=(1, 2)).astype(np.uint8)
     top = device.download(base.boxes)[0]
     box = np.stack([top[:3].min(axis=1), top[3:].max(axis=1)]).astype(np.float64)
     margin = 1e-3 * float((box[1] - box[0]).max())
     leaves = np.flatnonzero(surface.leaf) if surface.leaf.any() else np.arange(len(surface))  # what the tree holds
-    numbers = np.where(tree.order >= 0, leaves[tree.order], -1).astype(np.int32)
-    lists = neighbour_lists(tree, device.download(base.boxes), device.download(base.balls))
-    arrays = [device.upload(array) for array in (blocks, feet, limited, numbers, *lists)]
+    order = device.upload(np.where(base.tree.order >= 0, leaves[base.tree.order], -1).astype(np.int32))
+    for_rays: list[DeviceArray] = []  # from the first single ray on
 
     def launch(mode, rays_count, rays, hits):
+        if not for_rays:
+            for_rays.extend(single_arrays(device, base, order))
         size, group, batch = items(device, rays_count)
-        constants = {"VW": device.lanes, "DEGREE": surface.degree, "ORIENTED": surface.oriented, "MODE": mode}
+        constants = {"VW": device.lanes, "DEGREE": base.degree, "ORIENTED": base.oriented, "MODE": mode}
         device.kernel("trace/ray_slim.cl", constants=constants)(
-            size, group, rays_count, batch, tree.roots, tree.first_bottom, base.boxes, *arrays, rays, hits)
+            size, group, rays_count, batch, base.tree.roots, base.tree.first_bottom, base.boxes, *for_rays, rays, hits)
 
-    return Traced(surface.origin, 1.0, box + margin * np.array([[-1.0], [1.0]]), launch)
+    colors = surface.colors
+    return Traced(surface.origin, 1.0, box + margin * np.array([[-1.0], [1.0]]), launch,
+                  float(np.median(surface.radii[leaves])), base, order,
+                  None if colors is None else lambda primitives: LINEAR_OF_BYTE[colors[primitives, :3]])
+
+
+def single_arrays(device: Device, base: TracedSlim, order: DeviceArray) -> list[DeviceArray]:
+    """Return what single rays need beside the boxes: records, balls, numbers, neighbour lists (ray_slim.cl)."""
+    tree, count = base.tree, COEFFICIENTS[base.degree]
+    planes = device.download(base.surfels)  # x y z r r, normal, low high slope, coefficients
+    balls = planes[:, :4].copy()
+    balls[:, :3] = np.where((tree.order < 0).reshape(-1, 1, WIDTH), FAR, balls[:, :3])
+    in_slots = planes.transpose(0, 2, 1).reshape(len(tree.order), -1)
+    records = np.zeros((len(tree.order), 16 if base.degree < 3 else 32), np.float32)
+    records[:, :7], records[:, 7] = in_slots[:, [0, 1, 2, 3, 5, 6, 7]], 1 / in_slots[:, 3]
+    records[:, 8:8 + min(count, 6)] = in_slots[:, 11:11 + min(count, 6)]
+    records[:, 14:16] = device.download(base.tails)[:, 8:10]
+    if count > 6:
+        records[:, 16:20] = in_slots[:, 17:21]
+    first, *near = neighbour_lists(tree, device.download(base.boxes), device.download(base.balls))
+    records, balls, first, *near = (device.upload(array) for array in (records, balls, first, *near))
+    return [records, balls, order, first, *near]
 
 
 def neighbour_lists(tree: Tree, boxes: NDArray, balls: NDArray) -> tuple[NDArray, NDArray, NDArray]:

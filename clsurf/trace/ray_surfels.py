@@ -4,13 +4,15 @@ Kernel: kernels/trace/ray_surfels.cl.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from ..device import Device
+from ..surface.srgb import LINEAR_OF_BYTE
 from ..surface.surfel import SurfelHierarchy
 from .kinds import NOTHING, Traced, items, register
-from .ray_triangles import trace_triangles
+from .ray_triangles import mesh_colors, trace_triangles
 from .tree import WIDTH, node_boxes, plant
 
 MARGIN = 1e-6  # of boxes, frame units: more than the kernel's rounding, as coordinates are at most 1 or so
@@ -21,7 +23,8 @@ SLAB, LEAN = 0.3, 0.25  # kernels/trace/ray_surfels.cl
 def trace_surfels(device: Device, surface: SurfelHierarchy) -> Traced:
     """Put the finest level on the device, in a frame around its middle whose longest side is 1/2 to 1."""
     if surface.hybrid:
-        return trace_triangles(device, surface.mesh, None)
+        return replace(trace_triangles(device, surface.mesh, None), grain=surface.spacing,
+                       colors=mesh_colors(surface.triangles, surface.vertex_colors))
     base = surface.base
     usable = (np.isfinite(surface.positions[base]).all(axis=1) & np.isfinite(surface.normals[base]).all(axis=1)
               & np.isfinite(surface.radii[base]) & (surface.radii[base] > 0))
@@ -37,7 +40,7 @@ def trace_surfels(device: Device, surface: SurfelHierarchy) -> Traced:
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else 1.0
     centers, reach, own = (positions - middle) / unit, reach / unit + MARGIN, radii / unit
-    tree = plant(centers - reach, centers + reach)
+    tree = plant(device, centers - reach, centers + reach)
     fields = np.concatenate([centers, normals, own[:, None]], axis=1).astype(np.float32)
     blocks = tree.in_slots(fields, 0).reshape(-1, WIDTH, 7).transpose(0, 2, 1)  # empty slots have no radius
     arrays = [device.upload(node_boxes(tree, centers - reach, centers + reach)),
@@ -50,4 +53,6 @@ def trace_surfels(device: Device, surface: SurfelHierarchy) -> Traced:
             size, group, count, batch, tree.roots, tree.first_bottom, slack, *arrays, rays, hits)
 
     half = (high - low) / 2 / unit + 1e-3
-    return Traced(surface.origin + middle, unit, np.stack([-half, half]), launch)
+    colors = surface.colors
+    return Traced(surface.origin + middle, unit, np.stack([-half, half]), launch, surface.spacing,
+                  colors=None if colors is None else lambda surfels: LINEAR_OF_BYTE[colors[surfels, :3]])

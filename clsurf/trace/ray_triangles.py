@@ -1,6 +1,7 @@
 """Meshes and spatial patches for single rays: triangles in blocks of 16. Kernel: kernels/trace/ray_triangles.cl."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from ..errors import InputError
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
+from ..surface.srgb import LINEAR_OF_BYTE
 from .kinds import NOTHING, Traced, items, register
 from .tree import WIDTH, node_boxes, plant
 
@@ -21,7 +23,18 @@ FAR = 3.0  # where the triangle of an empty slot lies: outside the frame's box, 
 @register(Mesh)
 def trace_mesh(device: Device, mesh: Mesh) -> Traced:
     """Put the faces on the device."""
-    return trace_triangles(device, mesh, None)
+    held = trace_triangles(device, mesh, None)
+    if held.empty:
+        return held
+    some = mesh.faces[::max(len(mesh.faces) // 10000, 1)]
+    edges = np.linalg.norm(mesh.vertices[some[:, 0]].astype(np.float64) - mesh.vertices[some[:, 1]], axis=1)
+    grain = min(float(np.nanmedian(edges)) / 3, held.grain)  # faces of boxes are large, and near to each other
+    return replace(held, grain=grain, colors=mesh_colors(mesh.faces, mesh.colors))
+
+
+def mesh_colors(corners: NDArray, colors: NDArray | None):
+    """Return the function from faces to the mean linear colour of their vertices; it keeps arrays, not the mesh."""
+    return None if colors is None else lambda faces: LINEAR_OF_BYTE[colors[corners[faces], :3]].mean(axis=1)
 
 
 @register(PatchSurface)
@@ -32,7 +45,22 @@ def trace_patches(device: Device, surface: PatchSurface) -> Traced:
     first = np.flatnonzero((i < m - 1) & (j < n - 1))
     corners = np.stack([first, first + 1, first + m[first], first + m[first] + 1])
     whole = surface.opaque[corners].all(axis=0)
-    return trace_triangles(device, patch_mesh(surface), np.tile(patch[first[whole]], 2))
+    held = trace_triangles(device, patch_mesh(surface), np.tile(patch[first[whole]], 2))
+    spacing = np.linalg.norm(surface.axis_x, axis=1)
+    return replace(held, grain=float(np.median(spacing)) if len(spacing) else 0.0,
+                   colors=patch_colors(surface.colors, surface.color, surface.node_offset))
+
+
+def patch_colors(colors: NDArray | None, color, node_offset: NDArray):
+    """Return the function from patches to the mean linear colour of their nodes; it keeps arrays, not the surface."""
+    if colors is None:
+        return None if color is None else lambda patches: np.tile(LINEAR_OF_BYTE[np.asarray(color)], (len(patches), 1))
+
+    def means(patches):
+        sums = np.add.reduceat(LINEAR_OF_BYTE[colors[:, :3]], node_offset[:-1], axis=0)
+        return (sums / np.diff(node_offset)[:, None])[patches]
+
+    return means
 
 
 def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Traced:
@@ -53,8 +81,11 @@ def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Trac
         raise InputError(f"mesh: expected at most {LARGEST_COUNT:,} faces to trace, got {len(mesh.faces):,}: split it")
     bottoms = 16 * -(-len(mesh.faces) // WIDTH) / 15
     device.check_memory(triangles=int(bottoms * 36 * WIDTH), nodes=int(bottoms * 24 * WIDTH / 15))
-    finite = np.isfinite(mesh.vertices).all(axis=1)
-    kept = np.flatnonzero(finite[mesh.faces].all(axis=1))
+    finite = np.isfinite(mesh.vertices)
+    kept = np.arange(len(mesh.faces))
+    if not finite.all():
+        whole = finite.all(axis=1)[mesh.faces]
+        kept = np.flatnonzero(whole.all(axis=1))
     if not len(kept):
         return Traced(mesh.origin, 1.0, NOTHING, lambda *_: None)
     faces = mesh.faces[kept]
@@ -65,8 +96,10 @@ def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Trac
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else max(float(np.abs(middle).max()), 1.0)
     corners = ((mesh.vertices.astype(np.float64) - middle) / unit).astype(np.float32)[faces]
-    below, above = corners.min(axis=1).astype(np.float64) - MARGIN, corners.max(axis=1).astype(np.float64) + MARGIN
-    tree = plant(below, above)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    below = np.minimum(np.minimum(a, b), c) - np.float32(MARGIN)
+    above = np.maximum(np.maximum(a, b), c) + np.float32(MARGIN)
+    tree = plant(device, below, above)
     blocks = tree.in_slots(corners.reshape(-1, 9), FAR).reshape(-1, WIDTH, 9).transpose(0, 2, 1)
     order = kept if numbers is None else numbers[kept]
     arrays = [device.upload(node_boxes(tree, below, above)), device.upload(np.ascontiguousarray(blocks)),

@@ -86,7 +86,7 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
                   & np.isfinite(surface.normals).all(axis=1) & (radii > 0) & np.isfinite(radii) & (low <= high))
         below, above = piece_boxes(surface, low, high)
     below[~usable], above[~usable] = 1, -1
-    tree = plant(below, above)
+    tree = plant(device, below, above)
     centers = surface.centers.astype(np.float64)
     reach = radii[:, None] * (1 + 2e-6) + 2e-6 * np.abs(centers)
     planes = np.zeros((len(tree.order), SURFEL_FLOATS))

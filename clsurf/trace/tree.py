@@ -21,6 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device import Device
+
 WIDTH = 16
 EMPTY = 1e30
 
@@ -48,8 +50,9 @@ class Tree:
         values = np.asarray(values)
         if not len(values):
             return np.full((len(self.order), *values.shape[1:]), fill, values.dtype)
-        mask = (self.order >= 0).reshape(-1, *[1] * (values.ndim - 1))
-        return np.where(mask, values[np.maximum(self.order, 0)], np.asarray(fill, values.dtype))
+        out = values[np.maximum(self.order, 0)]
+        out[self.order < 0] = fill
+        return out
 
     def first_of_levels(self) -> list[int]:
         """Return the number of the first node of every level, and `node_count`."""
@@ -60,15 +63,17 @@ class Tree:
         return [*out, self.node_count]
 
 
-def plant(low: NDArray, high: NDArray) -> Tree:
-    """Return the tree of primitives with the boxes `low`, `high` (n, 3), halved at the median along the longest side.
+def plant(device: Device, low: NDArray, high: NDArray) -> Tree:
+    """Return the tree of primitives with the boxes `low`, `high` (n, 3), halved by the surface area heuristic.
 
     Primitives whose box is not finite or is turned inside out are left out. Bottom nodes are filled up, all but the
-    last of each split; the result depends on nothing but the input.
+    last of each half; the result depends on nothing but the input. Against halves at the median along the longest side
+    the dragon's rays are 1.1 times as fast.
     """
-    low, high = np.asarray(low, np.float64).reshape(-1, 3), np.asarray(high, np.float64).reshape(-1, 3)
-    with np.errstate(invalid="ignore"):
-        used = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & (low <= high).all(axis=1))
+    low, high = np.asarray(low).reshape(-1, 3), np.asarray(high).reshape(-1, 3)
+    with np.errstate(invalid="ignore", over="ignore"):
+        fits = (low <= high) & np.isfinite(low) & np.isfinite(high)
+    used = np.flatnonzero(fits[:, 0] & fits[:, 1] & fits[:, 2])  # NumPy's reductions along 3 take 10 times as long
     bottoms = max(-(-len(used) // WIDTH), 1)
     if bottoms == 1:
         order = np.full(WIDTH, -1, np.int32)
@@ -78,44 +83,37 @@ def plant(low: NDArray, high: NDArray) -> Tree:
     while WIDTH * full < bottoms:
         full *= WIDTH
     roots = -(-bottoms // full)
-    order, start, count = _split((low[used] / 2 + high[used] / 2).astype(np.float32), roots, full)
+    if len(used) < len(low):
+        low, high = low[used], high[used]
+    order, count = _split(device, low, high, roots, full)
+    there = np.arange(WIDTH) < count[:, None]
     slots = np.full((roots * full, WIDTH), -1, np.int32)
-    bottom = np.repeat(np.arange(roots * full), count)
-    slots[bottom, np.arange(len(used)) - start[bottom]] = used[order]
+    slots[there] = used[order]
     first = 1 + roots * ((full - 1) // (WIDTH - 1))
     return Tree(roots, first + roots * full, first, slots.ravel())
 
 
-def _split(points: NDArray, roots: int, full: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the order of `points` (n, 3) along the bottom nodes; and where each node's part starts, and its length."""
-    order = np.arange(len(points))
-    start, count, room = np.array([0]), np.array([len(points)]), np.array([roots * full])
-    while room.max() > 1:
-        segment = np.repeat(np.arange(len(start)), count)
-        own = points[order]
-        key = own[np.arange(len(own)), _longest(own, start, count)[segment]] + np.float32(0)  # -0 becomes 0
-        bits = key.view(np.int32).astype(np.int64)
-        bits = np.where(bits < 0, -(bits & 0x7FFFFFFF), bits) + (segment.astype(np.int64) << 33)
-        order = order[np.argsort(bits, kind="stable")]
-        # Whole roots are told apart first, then each root's nodes are halved.
-        left = np.where(room > full, -(-(room // full) // 2) * full, -(-room // 2))
-        units = -(-count // WIDTH)
-        first = np.minimum(count, WIDTH * -(-units * left // room))
-        start = np.stack([start, start + first], axis=1).ravel()
-        count = np.stack([first, count - first], axis=1).ravel()
-        room = np.stack([left, room - left], axis=1).ravel()
-        start, count, room = start[room > 0], count[room > 0], room[room > 0]
-    return order, start, count
-
-
-def _longest(points: NDArray, start: NDArray, count: NDArray) -> NDArray:
-    """Return the axis along which each segment of `points` reaches farthest."""
-    out = np.zeros(len(start), np.int64)
-    some = count > 0
-    if some.any():
-        at = start[some]
-        out[some] = (np.maximum.reduceat(points, at) - np.minimum.reduceat(points, at)).argmax(axis=1)
-    return out
+def _split(device: Device, low: NDArray, high: NDArray, roots: int, full: int) -> tuple[NDArray, NDArray]:
+    """Return the order of boxes (n, 3) along the bottom nodes, and how many of them each node has."""
+    n = len(low)
+    ends = np.array([[side[:, axis].min(), side[:, axis].max()] for side in (low, high) for axis in range(3)], float)
+    middle = ends[:3, 0] / 2 + ends[3:, 1] / 2
+    unit = max(float((ends[3:, 1] / 2 - ends[:3, 0] / 2).max()), 1e-300)  # so that float32 holds areas
+    boxes = [np.zeros((n, 4), np.float32) for _ in range(2)]
+    for values, side in zip(boxes, (low, high), strict=True):
+        values[:, :3] = (side - middle) / unit
+    boxes = [device.upload(values) for values in boxes]
+    order, other = device.upload(np.arange(n, dtype=np.int32)), device.empty((n,), np.int32)
+    rest, keys = device.empty((n,), np.int32), device.empty((n,), np.float32)
+    parts = np.array([[0, n, roots * full]], np.int32)
+    while parts[:, 2].max() > 1:
+        halves = device.empty((2 * len(parts), 3), np.int32)
+        device.kernel("trace/split_nodes.cl")((len(parts),), (1,), len(parts), full, device.upload(parts), order,
+                                              *boxes, halves, other, rest, keys)
+        parts = device.download(halves)
+        parts = np.ascontiguousarray(parts[parts[:, 2] > 0])
+        order, other = other, order
+    return device.download(order, copy=False), parts[:, 1]
 
 
 def node_boxes(tree: Tree, low: NDArray, high: NDArray) -> NDArray:

@@ -5,6 +5,9 @@ from dataclasses import dataclass, replace
 # What is drawn while something moves: every so many-th pixel each way, and the level of detail in pixels.
 STEPS = ((1, 4.0), (1, 8.0), (2, 8.0), (3, 8.0), (4, 12.0), (6, 16.0), (8, 24.0))
 BUDGET = 0.033  # seconds of drawing a moving picture, of the 0.066 between two at 15 a second: the rest is the canvas's
+APART = 1 / 18  # seconds between moving pictures above which the canvas is taken not to keep up with their size
+PAUSE = 0.25  # seconds between two pictures after which they are not of one movement
+SMALL = 2  # the step of STEPS that is small enough for any canvas
 SETTLE = 0.12  # seconds without a movement after which the picture is refined
 LONGEST = 1.5  # seconds: a refinement expected to take longer is left out
 
@@ -31,11 +34,13 @@ class Pace:
     shown: int = 0  # 0: as it moved, 1: full, 2: fine
     moved: float = float("-inf")  # time of the last movement, seconds
     full_seconds: float = 0.0  # that the last full picture took
+    last: float = float("-inf")  # time of the last moving picture, seconds
+    least: int = 0  # step that the canvas asks for in this movement
 
     def quality(self, now: float) -> Quality:
         """Return how to draw the picture that is asked for at `now`."""
         if not self._settled(now):
-            reduce, lod = STEPS[self.step]
+            reduce, lod = STEPS[max(self.step, self.least)]
             return Quality(reduce, lod)
         return FINE if self.shown >= 1 and self._fine_is_fast else FULL
 
@@ -60,16 +65,20 @@ class Pace:
             return replace(self, shown=2)
         if quality == FULL and self._settled(now):
             return replace(self, shown=1, full_seconds=seconds)
-        step = self.step
+        gap, step, least = now - self.last, self.step, self.least
+        if gap > PAUSE:
+            least = 0
+        elif gap > APART and seconds <= BUDGET:
+            least = max(least, min(max(step, least) + 1, SMALL))
         if seconds > BUDGET:
             step = min(step + 1, len(STEPS) - 1)
             if seconds > 3 * BUDGET:
                 step = min(step + 1, len(STEPS) - 1)
         elif step > 0:
             # A finer step is expected to take longer by its pixels, or by a third where only the detail is finer.
-            ratio = (STEPS[step][0] / STEPS[step - 1][0]) ** 2
+            ratio = (quality.reduce / STEPS[step - 1][0]) ** 2
             step -= seconds * max(ratio, 1.33) < 0.7 * BUDGET
-        return replace(self, step=step)
+        return replace(self, step=step, last=now, least=least)
 
     def due(self, now: float) -> float | None:
         """Return in how many seconds the next refinement is to be drawn; None: the picture is as fine as it gets."""

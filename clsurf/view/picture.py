@@ -18,7 +18,8 @@ from .state import ViewState, pixel_of
 CHANNELS = ("color", "normal", "depth", "mean", "gaussian", "k1", "k2", "level", "id")
 LINES = ((), ("contours",), ("contours", "suggestive_contours"),
          ("contours", "suggestive_contours", "ridges", "valleys"))
-BYTES = np.rint(255 * to_srgb(np.arange(4096) / 4095)).astype(np.uint8)  # of linear values: 37 to 4 ms at 800x600
+BYTES = np.rint(255 * to_srgb(np.arange(4096) / 4095)).astype(np.uint8)  # of linear values
+SPAN = 1024  # pixels of a work-item of pack_bytes
 
 
 def channels_of(scene: Scene) -> tuple[str, ...]:
@@ -44,13 +45,18 @@ def _has(scene: Scene, names) -> bool:
     return True
 
 
-def to_bytes(color: NDArray) -> NDArray:
-    """Return (h, w, 4) uint8 sRGB, opaque, of linear colour (h, w, 4) over an opaque background."""
-    out = np.empty(color.shape, np.uint8)
-    levels = (color[..., :3] * np.float32(4095) + np.float32(0.5)).astype(np.uint16)
-    out[..., :3] = BYTES.take(levels, mode="clip")
-    out[..., 3] = 255
-    return out
+def to_bytes(device, color: NDArray) -> NDArray:
+    """Return (h, w, 4) uint8 sRGB, opaque, of linear premultiplied colour (h, w, 4); white is behind what is not.
+
+    By a kernel 1 ms, by NumPy 16 ms at 800x600 on two cores.
+    """
+    height, width = color.shape[:2]
+    colors = device.upload(np.ascontiguousarray(color, np.float32))
+    bytes_ = device.empty((height, width, 4), np.uint8)
+    count = height * width
+    device.kernel("view/pack_bytes.cl", constants={"SPAN": SPAN, "LEVELS": len(BYTES)})(
+        (-(-count // SPAN),), (1,), colors, count, device.upload(BYTES), bytes_)
+    return device.download(bytes_)
 
 
 def draw(renderer, scene: Scene, state: ViewState, size: tuple[int, int], quality: Quality, kinds=(),
@@ -88,7 +94,7 @@ def draw(renderer, scene: Scene, state: ViewState, size: tuple[int, int], qualit
                             supersampling=quality.supersampling, **options)
     shown = frame
     if channel == "normal":
-        pixels = normal_colors(frame, state.camera)
+        pixels = normal_colors(renderer.device, frame, state.camera)
     elif channel != "color":
         limits = {} if limits is None else limits
         known = limits.get((channel, scene))
@@ -100,9 +106,9 @@ def draw(renderer, scene: Scene, state: ViewState, size: tuple[int, int], qualit
         found = lines(plain, kinds, device=renderer.device)
         if channel == "normal":
             shown = Frame({"color": linear(pixels)}, frame.origin, frame.camera)
-        pixels = to_bytes(found.draw(shown).color)
+        pixels = to_bytes(renderer.device, found.draw(shown).color)
     elif channel != "normal":
-        pixels = to_bytes(shown.color)
+        pixels = to_bytes(renderer.device, shown.color)
     return pixels, frame
 
 
@@ -113,11 +119,11 @@ def largest_value(values: NDArray) -> float | None:
     return rounded_up(float(np.quantile(given, SHARE))) if len(given) else None
 
 
-def normal_colors(frame: Frame, camera) -> NDArray:
+def normal_colors(device, frame: Frame, camera) -> NDArray:
     """Return (h, w, 4) uint8: normals in the camera's axes as colours, the frame's own where there is none."""
     turned = frame.normal @ camera.rotation.T.astype(np.float32)
     hit = np.isfinite(frame.depth)
-    pixels = to_bytes(frame.color)
+    pixels = to_bytes(device, frame.color)
     pixels[hit, :3] = np.clip(127.5 * turned[hit] + 128, 0, 255).astype(np.uint8)
     return pixels
 

@@ -120,6 +120,7 @@ def web_application():
     kind, script = http.resources["renderview-client.js"]
     # Behind a proxy with TLS a page may open secure connections only.
     script = script.replace("'ws://' +", "(location.protocol === 'https:' ? 'wss://' : 'ws://') +")
+    script = script.replace("console.log('created ClientRenderView')", "view.viewElement.focus()")  # keys at once
     http.asgi.close = lambda: None  # the server closes the connections; rendercanvas 2.7 only seems to
     http.asgi._resources = {**http.resources, "index.html": ("text/html; charset=utf-8", PAGE),
                             "renderview-client.js": (kind, script), "favicon.ico": ("image/x-icon", b"")}

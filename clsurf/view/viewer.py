@@ -61,8 +61,6 @@ class Viewer:
         up = np.asarray(up, np.float64)
         if up.shape != (3,) or not 0 < np.linalg.norm(up) < np.inf:
             raise InputError(f"up: expected three numbers, not all 0, got {up.tolist()}")
-        if options.get("background") is not None and len(options["background"]) == 4 and options["background"][3] < 1:
-            raise InputError("background: expected an opaque one to view, got a transparent one")
         box = np.asarray(self.scene.bounds)
         box = box if np.isfinite(box).all() else np.array([[-1.0] * 3, [1.0] * 3])
         self.box = box

@@ -3,7 +3,7 @@
 #include "common/bins.clh"
 
 __kernel void count_bins(__global const uint *order, __global const uint *depth_offsets, __global const short4 *full,
-                         int parts, int bins_x, int bin_count, __global uint *counts) {
+                         int parts, int bins_x, int bin_count, __global const int *touched, __global uint *counts) {
   int part = get_global_id(0), count = depth_offsets[DEPTH_BUCKETS], chunk = (count + parts - 1) / parts;
   int begin = part * chunk, end = begin + chunk < count ? begin + chunk : count;
   __global uint *mine = counts + (size_t)part * bin_count;
@@ -11,6 +11,6 @@ __kernel void count_bins(__global const uint *order, __global const uint *depth_
   for (int i = begin; i < end; i++) {
     short4 r = full[order[i]];
     for (int y = r.y >> 1; y <= r.w >> 1; y++)
-      for (int x = r.x >> 1; x <= r.z >> 1; x++) mine[y * bins_x + x]++;
+      for (int x = r.x >> 1; x <= r.z >> 1; x++) mine[y * bins_x + x] += WANTED(y * bins_x + x);
   }
 }

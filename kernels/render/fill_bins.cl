@@ -4,7 +4,7 @@
 
 __kernel void fill_bins(__global const uint *order, __global const uint *depth_offsets, __global const short4 *full,
                         __global const short4 *core, __global const uint *keys, int parts, int bins_x, int bin_count,
-                        __global uint *counts, __global const uint *offsets, __global uint2 *pairs) {
+                        __global const int *touched, __global uint *counts, __global const uint *offsets, __global uint2 *pairs) {
   int part = get_global_id(0), count = depth_offsets[DEPTH_BUCKETS], chunk = (count + parts - 1) / parts;
   int begin = part * chunk, end = begin + chunk < count ? begin + chunk : count;
   __global uint *mine = counts + (size_t)part * bin_count;
@@ -18,6 +18,7 @@ __kernel void fill_bins(__global const uint *order, __global const uint *depth_o
     for (int y = r.y >> 1; y <= r.w >> 1; y++) {
       uint row = rows_of(r.y, r.w, y), core_row = rows_of(c.y, c.w, y);
       for (int x = r.x >> 1; x <= r.z >> 1; x++) {
+        if (!WANTED(y * bins_x + x)) continue;
         uint bits = (core_row & columns_of(c.x, c.z, x)) << 4 | (row & columns_of(r.x, r.z, x));
         pairs[mine[y * bins_x + x]++] = (uint2)(index, key | bits);
       }

@@ -71,11 +71,11 @@ __kernel void light_nodes(__global const float *view, __global const float *shad
     for (int c = 0; c < 3; c++) { reflected[c] = shading[AMBIENT]; gloss[c] = 0.0f; }
     for (int i = 0; i < (int)shading[LIGHT_COUNT]; i++) {
       __global const float *lamp = shading + LIGHTS + i * LIGHT_FLOATS;
-      float v[3] = {lamp[LIGHT_X], lamp[LIGHT_Y], lamp[LIGHT_Z]};
-      if ((int)lamp[LIGHT_KIND] == POINT)
+      float v[3] = {lamp[LIGHT_X], lamp[LIGHT_Y], lamp[LIGHT_Z]}, s[3] = {lamp[SPOT_X], lamp[SPOT_Y], lamp[SPOT_Z]};
+      if ((int)lamp[LIGHT_KIND] >= POINT)
         for (int r = 0; r < 3; r++) v[r] -= origin[r];
-      add_lamp(shading, lamp, IN_PATCH(v, 0), IN_PATCH(v, 1), IN_PATCH(v, 2), X, Y, Z, nx, ny, nz, ex, ey, ez, reflected,
-               gloss);
+      Aim aim = {IN_PATCH(v, 0), IN_PATCH(v, 1), IN_PATCH(v, 2), IN_PATCH(s, 0), IN_PATCH(s, 1), IN_PATCH(s, 2)};
+      add_lamp(shading, lamp, aim, X, Y, Z, nx, ny, nz, ex, ey, ez, reflected, gloss);
     }
     for (int c = 0; c < 3; c++) {
       base[c] = (base[c] * reflected[c] + gloss[c]) * (65535.0f / LIT_RANGE) + 0.5f;

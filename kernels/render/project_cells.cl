@@ -3,7 +3,7 @@
 // plane (Olano, Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates", 1997). Set up once here, not in every
 // bin: 2 of 4 ms of a bunny's tile stage.
 //
-// One work-item per block; lanes are cells. Twin: tests/reference/render_cells.py, project_cells.
+// One work-item per block; lanes are cells. Test: tests/test_render_scale_map.py, test_project_cells.
 #include "render/cells.clh"
 #include "common/bins.clh"
 

@@ -4,10 +4,12 @@
 // cell that its triangles have found. Otherwise (a geosphere) the triangle itself is drawn, its normals interpolated.
 //
 // One work-item per tile (VW lanes are pixels of 4x4 blocks), or a work-group of 64 per tile (VW = 1: one bin's pixels at
-// a time). Twin: tests/reference/render_cells.py, tile_cells.
+// a time). Twins: the net's triangles by brute force, and the interpolated map itself (tests/test_render_scale_map.py,
+// test_tile_cells).
 #include "render/cells.clh"
 #include "common/planes.clh"
 #include "common/cube.clh"
+#include "common/clip.clh"
 
 #ifndef TILE_BINS
 #define TILE_BINS 4
@@ -24,6 +26,9 @@
 typedef struct {
   VF z;       // -1 / depth, or depth where the picture is orthographic
   VI seen;    // node A of the cell times 4, 2 for the triangle DCB, 1 where it is seen from behind; -1: nothing
+#if CLIP_PLANES
+  VF near;    // the same of the least depth that is drawn
+#endif
 #if !CAST
   VF p, q, r; // edge functions across from the corners A, B, C or D, C, B
 #endif
@@ -40,7 +45,11 @@ INLINE void draw_triangle(__global const float *cells, int cell, int across_p, i
   if (!any_lane(in)) return;
   VF z = EDGE(depth);
   z = lesser(greater(z, (VF)(CELL(low))), (VF)(CELL(low + 1)));
+#if CLIP_PLANES
+  in = in & (z < at->z) & (z > at->near);
+#else
   in = in & (z < at->z) & (z > nearest);
+#endif
   at->z = SEL(at->z, z, in);
   at->seen = SEL(at->seen, (VI)(seen), in);
 #if !CAST
@@ -58,6 +67,21 @@ INLINE void draw_cell(__global const float *record, int cell, int node, VF px, V
                   4 * node + 2 + (as_int(record[BACK_2]) >> cell & 1), px, py, nearest, at);
 }
 #include "render/cells_shown.clh"
+
+// Start a pixel behind what it shows, or where clip planes end what is drawn.
+INLINE void start_pixels(__global const float *view, VF px, VF py, VF before, Pixels *at) {
+  const int perspective = view[PERSPECTIVE] > 0.0f;
+  const float unit = view[SCALE];
+  at->seen = -1;
+#if CLIP_PLANES
+  VF low = view[NEAR], high = before, none = -INFINITY;
+  clip_range(view, px, py, &low, &high);
+  at->near = perspective ? SEL(none, -unit / low, low > 0.0f) : low / unit;
+  at->z = perspective ? SEL(none, -unit / high, high > 0.0f) : high / unit;
+#else
+  at->z = perspective ? -unit / before : before * (1.0f / unit);
+#endif
+}
 
 __kernel void tile_cells(__global const float *view, __global const uint2 *pairs, __global const uint *offsets,
                          __global const float *records, __global const float4 *nodes, int side, int grid_nodes,
@@ -83,15 +107,12 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
     __global float *planes = tile_planes + (size_t)bin * BIN_PIXELS * FIELDS;
     int was_touched = touched[bin] >= 0;
     float bx = bin_x * BIN + 4.0f, by = bin_y * BIN + 4.0f;
-#define START(at_) \
-    VF before = EMPTY_DEPTH; \
-    if (was_touched) before = load_plane(planes, FIELD_DEPTH, at_); \
-    VF start = perspective ? -unit / before : before * (1.0f / unit);
+#define BEFORE(at_) VF before = was_touched ? load_plane(planes, FIELD_DEPTH, at_) : (VF)(EMPTY_DEPTH);
 #if VW == 1
     float px = bx + (pixel & 7) - 3.5f, py = by + (pixel >> 3) - 3.5f;
     Pixels here;
-    START(pixel)
-    here.z = start; here.seen = -1;
+    BEFORE(pixel)
+    start_pixels(view, px, py, before, &here);
     for (int e = begin; e < end; e++) {
       __global const float *record = records + (size_t)INDEX_OF(pairs[e]) * CELL_RECORD;
       int base = as_int(record[BASE_NODE]);
@@ -111,8 +132,9 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
     Pixels all[64 / VW];
     for (int b = 0; b < 64 / VW; b++) {
       int quarter = b / (16 / VW), qx = (quarter & 1) * 4, qy = (quarter >> 1) * 4 + b % (16 / VW) * (VW / 4);
-      START(qy * BIN + qx)
-      all[b].z = start; all[b].seen = -1;
+      BEFORE(qy * BIN + qx)
+      VF px = TO_VF(LANE_INDEX & 3) + (bx + qx - 3.5f), py = TO_VF(LANE_INDEX >> 2) + (by + qy - 3.5f);
+      start_pixels(view, px, py, before, &all[b]);
     }
     for (int e = begin; e < end; e++) {
       uint2 pair = pairs[e];
@@ -150,7 +172,7 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
     for (int b = 0; b < 64 / VW; b++) {
       int q = b / (16 / VW), qx = (q & 1) * 4, qy = (q >> 1) * 4 + b % (16 / VW) * (VW / 4);
       VF px = TO_VF(LANE_INDEX & 3) + (qx - 3.5f), py = TO_VF(LANE_INDEX >> 2) + (qy - 3.5f);
-      START(qy * BIN + qx)
+      BEFORE(qy * BIN + qx)
       show_pixels(view, nodes, side, grid_nodes, surface, &all[b], before, px + bx, py + by, planes, qy * BIN + qx);
     }
     touched[bin] = (was_touched ? touched[bin] : 0) + tests;

@@ -75,6 +75,19 @@ __kernel void tile_patches(__global const float *view, __global const short *box
   tile = spread_tile(tile, tile_count);
   int width = (int)view[WIDTH], height = (int)view[HEIGHT];
   int bin_x = tile % tiles_x * TILE_BINS, bin_y = tile / tiles_x * TILE_BINS;
+#if MASKED
+  int some_wanted = 0;
+  uchar wanted[TILE_BINS * TILE_BINS];
+  for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
+    int x = bin_x + i % TILE_BINS, y = bin_y + i / TILE_BINS;
+    wanted[i] = x < bins_x && y < bins_y && WANTED(y * bins_x + x);
+    some_wanted |= wanted[i];
+  }
+  if (!some_wanted) return;
+#define WANTED_HERE(bin) wanted[bin]
+#else
+#define WANTED_HERE(bin) 1
+#endif
   to.x = bin_x * BIN; to.y = bin_y * BIN;
   to.slots = slots;
   to.cost = cost;
@@ -128,7 +141,7 @@ __kernel void tile_patches(__global const float *view, __global const short *box
     for (int i = 0; i < found; i++) sorted[starts[CLASS_OF(hits[i])]++] = hits[i];
     uint farthest[TILE_BINS * TILE_BINS];
     uchar stale[TILE_BINS * TILE_BINS];
-    for (int i = 0; i < TILE_BINS * TILE_BINS; i++) { farthest[i] = NO_SAMPLE; stale[i] = 0; }
+    for (int i = 0; i < TILE_BINS * TILE_BINS; i++) { farthest[i] = WANTED_HERE(i) ? NO_SAMPLE : 0u; stale[i] = 0; }
     for (int i = 0; i < found; i++) {
       int p = sorted[i];
       int4 b = BOX(p);
@@ -141,8 +154,8 @@ __kernel void tile_patches(__global const float *view, __global const short *box
       for (int y = y0; y <= y1 && !shows; y++)
         for (int x = x0; x <= x1 && !shows; x++) {
           int bin = y * TILE_BINS + x;
-          if (stale[bin]) { farthest[bin] = farthest_of(slots, bin); stale[bin] = 0; }
-          shows = farthest[bin] >= key;
+          if (stale[bin] && WANTED_HERE(bin)) { farthest[bin] = farthest_of(slots, bin); stale[bin] = 0; }
+          shows = farthest[bin] >= key && WANTED_HERE(bin);
         }
       if (!shows) continue;
       for (int y = y0; y <= y1; y++)
@@ -217,7 +230,7 @@ __kernel void tile_patches(__global const float *view, __global const short *box
   if (!any) return;
   for (int b = 0; b < TILE_BINS * TILE_BINS; b++) {
     int x = bin_x + b % TILE_BINS, y = bin_y + b / TILE_BINS;
-    if (x >= bins_x || y >= bins_y) continue;
+    if (x >= bins_x || y >= bins_y || !WANTED_HERE(b)) continue;
     int bin = y * bins_x + x, was_touched = touched[bin] >= 0;
     __global float *planes = all_planes + (size_t)bin * BIN_PIXELS * FIELDS;
 #if VW == 1
@@ -240,7 +253,7 @@ __kernel void tile_patches(__global const float *view, __global const short *box
   barrier(CLK_GLOBAL_MEM_FENCE);
   for (int b = item; b < TILE_BINS * TILE_BINS; b += GROUP) {
     int x = bin_x + b % TILE_BINS, y = bin_y + b / TILE_BINS, bin = y * bins_x + x;
-    if (x < bins_x && y < bins_y) touched[bin] = (touched[bin] >= 0 ? touched[bin] : 0) + cost[b];
+    if (x < bins_x && y < bins_y && WANTED_HERE(b)) touched[bin] = (touched[bin] >= 0 ? touched[bin] : 0) + cost[b];
   }
 #endif
 #endif

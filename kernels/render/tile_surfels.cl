@@ -10,6 +10,7 @@
 #include "common/surfel.clh"
 #include "common/bins.clh"
 #include "common/planes.clh"
+#include "common/clip.clh"
 #include "common/rims.clh"
 
 #ifndef TILE_BINS
@@ -36,7 +37,7 @@
 // The pairs of one block, a segment of the bin's list at a time: what remains has no unpredictable branch.
 #define PAIRS const uint2 *
 #define SKIP(pair, bits)
-#define SEGMENT 256
+#define SEGMENT 64
 INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *kept) {
   int n = 0;
   for (int e = 0; e < count; e++) {
@@ -82,10 +83,11 @@ INLINE VI texels_at(__global const float *k, VF u, VF v, VF inverse) {
   return TO_VI(x) + TO_VI(y) * size + as_int(k[MAP]);
 }
 
-// Pass 1: the largest K, in front of those in `best`, its side and its surfel; (rx, ry, rz) are the rays, model space.
+// Pass 1: the largest K between `smallest` and `largest`, in front of those in `best`, its side and its surfel;
+// (rx, ry, rz) are the rays, model space.
 INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global const float *records,
-                     __global const uint *atlas, VF px, VF py, VF rx, VF ry, VF rz, VF largest, VF *best, VF *at,
-                     VF *facing, VI *nearest, int *cost) {
+                     __global const uint *atlas, VF px, VF py, VF rx, VF ry, VF rz, VF smallest, VF largest,
+                     VF *best, VF *at, VF *facing, VI *nearest, int *cost) {
   int more = 1;
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
@@ -99,6 +101,9 @@ INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global 
     if (k[FACE] < 0.0f) key = IS_PERSPECTIVE ? where - k[BIAS] * where * where : where - k[BIAS];
     VI good = (u * u + v * v < k[CORE2] * one) & (where < largest) & (key > *best);
     if (IS_PERSPECTIVE) good = good & (where > 0.0f);
+#if CLIP_PLANES
+    good = good & (where > smallest);
+#endif
     *cost += 1;
     if (!any_lane(good)) continue;
     if (MAPS && !(as_int(k[FLAGS]) & IS_PLAIN)) {
@@ -188,8 +193,13 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   VF px = TO_VF(lane_x) + (bin_x * BIN + 0.5f), py = TO_VF(lane_y) + (bin_y * BIN + 0.5f);
   VF before = EMPTY_DEPTH, infinite = INFINITY;
   if (was_touched) before = load_plane(planes, FIELD_DEPTH, at);
-  // In front of `largest` nothing is drawn.
-  VF largest = IS_PERSPECTIVE ? (view[NEAR] > 0.0f ? 1.0f / view[NEAR] : INFINITY) : -view[NEAR];
+  // In front of `largest` nothing is drawn, nor behind `smallest`.
+  VF low = view[NEAR], high = infinite, largest, smallest;
+  clip_range(view, px, py, &low, &high);
+  if (IS_PERSPECTIVE) {
+    largest = SEL(infinite, 1.0f / low, low > 0.0f);
+    smallest = SEL(infinite, 1.0f / high, high > 0.0f);
+  } else { largest = -low; smallest = -high; }
   VF best = IS_PERSPECTIVE ? 1.0f / before : -before, first = 0.0f, facing = 0.0f;
   VF rx = 0.0f, ry = 0.0f;
   if (IS_PERSPECTIVE) { rx = (px - view[CX]) * (1.0f / view[FX]); ry = (view[CY] - py) * (1.0f / view[FY]); }
@@ -201,15 +211,15 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   sum.weight = sum.depth = sum.x = sum.y = sum.z = sum.red = sum.green = sum.blue = 0.0f;
   sum.number = 0;
 #if VW == 1
-  frontmost(pairs, count, 1u << quarter, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, largest,
-            &best, &first, &facing, &nearest, &cost);
+  frontmost(pairs, count, 1u << quarter, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest,
+            largest, &best, &first, &facing, &nearest, &cost);
 #else
   uint2 kept[SEGMENT];
   int more = 1;
   for (int from = 0; from < count && more; from += SEGMENT) {
     int n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
-    more = frontmost(kept, n, 0u, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, largest, &best,
-                     &first, &facing, &nearest, &cost);
+    more = frontmost(kept, n, 0u, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest, largest,
+                     &best, &first, &facing, &nearest, &cost);
   }
 #endif
   VI found = facing != 0.0f;

@@ -13,8 +13,8 @@
 #define TILE_BINS 4
 #endif
 
-typedef struct { VF depth, weight, fx, fy, ft, red, green, blue, facing; VI number; } Blend;
-typedef struct { VF px, py, low, z, hit, facing; } Ray;
+typedef struct { VF depth, weight, fx, fy, ft, red, green, blue, facing; VI number, slot; } Blend;
+typedef struct { VF px, py, low, z, hit, facing; VI slot; } Ray;
 
 // Pass 1: depth of every active ray's frontmost hit behind `low` and in front of `z`, and its side.
 INLINE void frontmost(__global const float *boxes, int roots, int first_bottom, __global const float *surfels,
@@ -57,6 +57,9 @@ INLINE void frontmost(__global const float *boxes, int roots, int first_bottom, 
             own_ray.z = SEL(own_ray.z, t, good);
             own_ray.hit = SEL(own_ray.hit, t, good);
             own_ray.facing = SEL(own_ray.facing, (VF)(1.0f), good);
+#if FIELD_SLOT >= 0
+            own_ray.slot = SEL(own_ray.slot, (VI)(slot + part + j), good);
+#endif
           }
           if (leaves >> j & 1u) {
             VI good = piece_root(k, own, p, -1.0f, u, v, w, du, dv, dw, &t);
@@ -65,6 +68,9 @@ INLINE void frontmost(__global const float *boxes, int roots, int first_bottom, 
             own_ray.z = SEL(own_ray.z, key, good);
             own_ray.hit = SEL(own_ray.hit, t, good);
             own_ray.facing = SEL(own_ray.facing, (VF)(-1.0f), good);
+#if FIELD_SLOT >= 0
+            own_ray.slot = SEL(own_ray.slot, (VI)(slot + part + j), good);
+#endif
           }
           *cost += 1;
         }
@@ -211,7 +217,7 @@ INLINE int trace_bin(__global const float *view, __global const float *boxes, __
     best[b].depth = INFINITY;
     best[b].weight = best[b].fx = best[b].fy = best[b].ft = best[b].facing = 1.0f;
     best[b].red = best[b].green = best[b].blue = 1.0f;
-    best[b].number = 0;
+    best[b].number = best[b].slot = 0;
   }
   int going = 1;
   for (int attempt = 0; attempt < TRIES; attempt++) {
@@ -220,7 +226,7 @@ INLINE int trace_bin(__global const float *view, __global const float *boxes, __
     for (int b = 0; b < BLOCKS; b++) {
       bound_block(ray[b].px, ray[b].py, active[b], b, &bounds);
       ray[b].z = SEL((VF)(-INFINITY), before[b], active[b]);
-      ray[b].hit = INFINITY; ray[b].facing = 0.0f;
+      ray[b].hit = INFINITY; ray[b].facing = 0.0f; ray[b].slot = 0;
       least_low = VMIN(least_low, least_lane(ray[b].low));
     }
     bound_packet(&bounds, &packet);
@@ -241,6 +247,9 @@ INLINE int trace_bin(__global const float *view, __global const float *boxes, __
 #define KEEP(x) best[b].x = SEL(best[b].x, sum[b].x, found)
       KEEP(depth); KEEP(weight); KEEP(fx); KEEP(fy); KEEP(ft); KEEP(number);
       best[b].facing = SEL(best[b].facing, ray[b].facing, found);
+#if FIELD_SLOT >= 0
+      best[b].slot = SEL(best[b].slot, ray[b].slot, found);
+#endif
 #if HAS_COLOR
       KEEP(red); KEEP(green); KEEP(blue);
 #endif
@@ -276,6 +285,9 @@ INLINE int trace_bin(__global const float *view, __global const float *boxes, __
 #endif
 #if FIELD_ID >= 0
     merge_plane(planes, FIELD_ID, at[b], AS_VF((VI)(surface)), closer);
+#endif
+#if FIELD_SLOT >= 0
+    merge_plane(planes, FIELD_SLOT, at[b], AS_VF(best[b].slot), closer);
 #endif
 #if FIELD_COUNT >= 0
     merge_plane(planes, FIELD_COUNT, at[b], AS_VF(best[b].number), closer);

@@ -326,18 +326,29 @@ def shade(view, shading, pixels, depth, gradient, base):
     n = np.where(hit[:, None], gradient, 1.0)
     n = n / np.linalg.norm(n, axis=1, keepdims=True)
     color = base * s[3]
-    for lamp in s[16:].reshape(-1, 8)[:int(s[12])]:
-        to = {0: eye, 1: np.broadcast_to(lamp[1:4], eye.shape), 2: lamp[1:4] - point}[int(lamp[0])]
-        to = to / np.linalg.norm(to, axis=1, keepdims=True)
+    for lamp in s[16:].reshape(-1, 16)[:int(s[12])]:
+        to, arrives = to_lamp(lamp, point, eye)
         half = to + eye
         half = half / np.linalg.norm(half, axis=1, keepdims=True)
         cosine = (n * to).sum(axis=1)
         shine = np.clip((n * half).sum(axis=1), 0, None) ** s[6] * s[5]
         lit = base * s[4] * cosine[:, None] + shine[:, None]
-        color = color + np.where(cosine > 0, 1, 0)[:, None] * lamp[4:7] * lit
+        color = color + np.where(cosine > 0, 1, 0)[:, None] * lamp[4:7] * lit * arrives[:, None]
     out = np.tile(s[8:12], (len(t), 1))
     out[hit] = np.concatenate([color, np.ones((len(t), 1))], axis=1)[hit]
     return out
+
+
+def to_lamp(lamp, point, eye):
+    """Unit directions (p, 3) to a lamp of the shading buffer, and the part (p,) of its light that arrives."""
+    to = {0: eye, 1: np.broadcast_to(lamp[1:4], eye.shape)}.get(int(lamp[0]), lamp[1:4] - point)
+    away = np.linalg.norm(to, axis=1)
+    to, arrives = to / away[:, None], np.ones(len(to))
+    if lamp[0] >= 2:
+        arrives = np.clip(1 - away**2 * lamp[7], 0, None) ** 2
+    if lamp[0] == 3:
+        arrives = arrives * np.clip((-to @ lamp[8:11] - lamp[11]) * lamp[12], 0, 1) ** 2
+    return to, arrives
 
 
 def reflection_lines(view, stripes, pixels, gradient, dark=0.06, soft=0.05):

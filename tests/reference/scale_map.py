@@ -123,3 +123,8 @@ def ray_scale_map(surface, origin, direction, samples=20000):
         same = (outside(middle) > 0) == (f[at] > 0)
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return (low + high) / 2
+
+
+def displace_nodes(surface, directions):
+    """Points (n, 3) in radii of a geosphere's directions on the map; NaN in holes."""
+    return filtered(surface, directions)[:, None] * unit(directions)

@@ -164,6 +164,7 @@ def tile_surfels(surface, view, drawn, maps=True):
             a, b = place @ u, place @ v
         ray = p / -p[2] if view.p.perspective else np.array([0, 0, -1.0])
         cosine = n @ ray
+        face = -np.sign(n @ p if view.p.perspective else cosine)
         ahead = not view.p.perspective or -p[2] > 0.5 * r
         if ahead and abs(cosine) < EDGE * np.linalg.norm(ray):
             continue
@@ -180,10 +181,10 @@ def tile_surfels(surface, view, drawn, maps=True):
             atlas = surface.normal_atlas[surface.map_offset[s]:surface.map_offset[s] + w * w, 3].reshape(w, w)
             plain = covered(atlas) and cosine**2 > spread**2 * (ray @ ray)
             if not plain:
-                seen = seen & (-np.sign(cosine) * ((normal @ view.rotation.T) * view.rays).sum(axis=1) < 0)
+                seen = seen & (face * ((normal @ view.rotation.T) * view.rays).sum(axis=1) < 0)
         deep = max(abs(n @ p), -LEAN * p[2]) if view.p.perspective else max(abs(cosine), LEAN)
         slab = (SLAB * r + float(surface.heights[s])) / deep
-        rows.append((t, a**2 + b**2, inside, seen, -np.sign(cosine), r * BACK, slab, normal, s))
+        rows.append((t, a**2 + b**2, inside, seen, face, r * BACK, slab, normal, s))
     pixels = len(view.rays)
     best, hit, side = np.full(pixels, np.inf), np.full(pixels, np.nan), np.zeros(pixels)
     nearest = np.full(pixels, -1)

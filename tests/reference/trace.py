@@ -57,24 +57,44 @@ def trace_lights(surface, view, lamps, reach, points, normals, eye):
     return out
 
 
+def lamp_rays(pixels, view, place, lamp, bit, step, reach, bins_x, planes, mask):
+    """Return the rays (n, 8) from the points of `pixels` to one lamp, in the frame of `place`."""
+    bins, at = pixels // 64, pixels % 64
+    depth, normal = planes[bins, 0, at].astype(float), planes[bins, 1:4, at].astype(float)
+    x, y = bins % bins_x * 8 + at % 8 + 0.5, bins // bins_x * 8 + at // 8 + 0.5
+    across = depth if view[17] else 1.0
+    points = np.stack([(x - view[15]) / view[13] * across, (view[16] - y) / view[14] * across, -depth], axis=1)
+    points += step * normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    to = np.tile(lamp[1:4].astype(float), (len(pixels), 1)) - (points if lamp[0] == 2 else 0)
+    length = np.linalg.norm(to, axis=1)
+    far = np.minimum(length, reach) if lamp[0] == 2 else np.full(len(pixels), reach)
+    want = ((to * normal).sum(axis=1) > 0) & (mask[bins, at] >> np.uint32(bit) & 1 == 0)
+    linear, zero, unit = place[:12].reshape(3, 4)[:, :3], place[:12].reshape(3, 4)[:, 3], place[12]
+    out = np.zeros((len(pixels), 8))
+    out[:, :3], out[:, 3] = points @ linear.T + zero, step / unit
+    out[:, 4:7] = to @ linear.T * (unit / length)[:, None]
+    out[:, 7] = np.where(want, np.minimum(far, 1e30) / unit, -1)
+    return out
+
+
 def light_bins(view, shading, pixels, depth, gradient, base, shadows, directions=None, hidden=None):
     """Linear colours (p, 3) of hit pixels: what `render.shade` gives, without hidden lamps and ambient light.
 
     `shadows` (p,) are bits of lamps; `hidden` (p, n) says which of the `directions` (n, 3) a point does not see.
     """
     s = np.array(shading, np.float64)
-    lamps = s[16:].reshape(-1, 8)
+    lamps = s[16:].reshape(-1, 16)
     unit = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     open_part = np.ones(len(pixels))
     if directions is not None:
         weight = np.clip(unit @ np.asarray(directions, np.float64).T, 0, None)
         open_part = np.where(hidden, 0, weight).sum(axis=1) / weight.sum(axis=1)
-    alone = np.concatenate([s[:16], np.zeros(8)])
+    alone = np.concatenate([s[:16], np.zeros(16)])
     alone[12] = 1
     color = base * s[3] * open_part[:, None]
     alone[3] = 0
     for i, lamp in enumerate(lamps[:int(s[12])]):
-        alone[16:24] = lamp
+        alone[16:32] = lamp
         seen = 1 - (np.asarray(shadows) >> i & 1)
         color = color + seen[:, None] * render.shade(view, alone, pixels, depth, gradient, base)[:, :3]
     return color

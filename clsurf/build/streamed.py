@@ -1,0 +1,400 @@
+"""SLIM surfaces of scans larger than memory: read once in chunks, cut into cells, written part by part.
+
+Every step (a run of a chunk, the plan, the coarse levels, the check of a cell, a cell) reads what is in the folder
+NAME.part and adds files that appear whole. So a build that was killed goes on where it was, and steps of one kind can
+run anywhere: their arguments are numbers (see `distributed`).
+"""
+
+import contextlib
+import json
+import logging
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device, open_device
+from ..device.arrays import give_back
+from ..errors import InputError
+from ..io.chunks import Source, open_source
+from ..io.files import writable_place
+from ..io.layout import from_arrays, to_arrays
+from ..io.parts import part_folder, write_index, write_part
+from ..io.store import load_store
+from .radius import Noise, automatic_error
+from .slim_levels import BOUND_SHARE, LEVELS
+from .stream_cells import (
+    Coarse,
+    Options,
+    build_cell,
+    build_coarse,
+    cell_points,
+    check_cell,
+    checked,
+)
+from .stream_plan import LARGEST, Plan, box_of, cut_cells, first_fine_level, measure, thinning
+from .stream_runs import THINNED, Lattice, Runs, chunk_written, lattice_of, make_run, write_whole
+
+log = logging.getLogger("clsurf")
+
+VERSION = 1  # of the files in NAME.part: others are begun anew
+FIXED_BYTES = 330_000_000  # of a process with its driver and kernels
+BYTES_PER_CELL_POINT = 900  # at the peak of a cell's build, halo and the next cell's points counted in
+BYTES_PER_CHUNK_POINT = 400  # of the chunk at hand and the one read ahead
+MOST_CHUNK = 1_000_000
+KEPT_PER_POINT = 60  # bytes of the device's memory that are kept from cell to cell
+LEAST_POINTS, MOST_POINTS = 50_000, 1_000_000  # of a cell; larger ones have less halo, but nothing is gained beyond
+FLAT = 0.3  # height over extent below which an airborne cloud is seen from above
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is taken at once, from the memory limit."""
+
+    chunk: int  # points read at once
+    cell: int  # points of a cell, without halo
+    thin: int  # points of the copy for the coarse levels
+
+
+def sizes_of(limit: int | None) -> Sizes:
+    """Return what fits in `limit` bytes; raises InputError where nothing does."""
+    limit = 2_000_000_000 if limit is None else limit
+    room = limit - FIXED_BYTES
+    cell = min(MOST_POINTS, room // BYTES_PER_CELL_POINT)
+    if cell < LEAST_POINTS:
+        least = FIXED_BYTES + LEAST_POINTS * BYTES_PER_CELL_POINT
+        raise InputError(f"memory_limit: expected at least {least / 1e6:.0f} MB, of which drivers and kernels take "
+                         f"{FIXED_BYTES / 1e6:.0f}, got {limit / 1e6:.0f} MB")
+    return Sizes(int(min(MOST_CHUNK, room // BYTES_PER_CHUNK_POINT)), int(cell), int(min(1_200_000, cell)))
+
+
+class Build:
+    """A streamed build in a folder; every method that makes something leaves what is already made.
+
+    Parameters
+    ----------
+    folder : Path
+        NAME.part; holds `job.json`, which says all that the steps need.
+    device : Device
+    """
+
+    def __init__(self, folder: Path, device: Device):
+        self.folder, self.device = Path(folder), device
+        self.work = self.folder / "work"
+        job = json.loads((self.folder / "job.json").read_bytes())
+        self.sizes, self.options = Sizes(**job["sizes"]), Options(**job["options"])
+        self.source_path = Path(job["source"]["path"])
+        self._runs: Runs | None = None
+        self._coarse: Coarse | None = None
+        self._checked: Coarse | None = None
+        self._plan: Plan | None = None
+
+    # Steps --------------------------------------------------------------------------------------------------------
+
+    def source(self) -> Source:
+        """Return the scan's file."""
+        return open_source(self.source_path, self.sizes.chunk)
+
+    def make_lattice(self, source: Source) -> None:
+        """Decide the fine cells from the first chunk, and write it as run 0."""
+        path = self.work / "lattice.json"
+        if path.exists():
+            return
+        for number in range(source.chunks):
+            chunk = source.read(number)
+            if len(chunk.points) > 1:
+                break
+        else:
+            raise InputError(f"{self.source_path}: expected points, got none that are finite")
+        lattice_of(chunk, self.device).write(path)
+
+    def lattice(self) -> Lattice:
+        """Return the fine cells."""
+        return Lattice.read(self.work / "lattice.json")
+
+    def make_run(self, source: Source, number: int) -> None:
+        """Write one chunk as a sorted run."""
+        make_run(self.work / "runs", number, source, self.lattice())
+        give_back()
+
+    def make_plan(self) -> None:
+        """Cut the cells and measure what they share."""
+        path = self.work / "plan.npz"
+        if path.exists():
+            return
+        runs = self.runs
+        count = int(runs.counts.sum())
+        if not count:
+            raise InputError(f"{self.source_path}: expected points, got none that are finite")
+        origin, diagonal = box_of(runs)
+        if not diagonal > 0:
+            raise InputError("scan: expected points with some extent, got all of them at one place")
+        noise, neighbours = measure(runs, diagonal, self.device)
+        error = automatic_error(noise) if self.options.error == "auto" else float(self.options.error)
+        cuts = cut_cells(runs.cells, runs.counts, self.sizes.cell)
+        thin = thinning(count, self.sizes.thin)
+        first = 1 if len(cuts) == 2 else first_fine_level(noise.spacing, thin)
+        reach = 2 * LARGEST * np.sqrt(thin / THINNED) * noise.spacing * diagonal
+        rings = 0 if len(cuts) == 2 else int(np.ceil(reach / runs.lattice.width))
+        _write_arrays(path, origin=origin, cuts=cuts, numbers=np.array([
+            diagonal, noise.variance, noise.spacing, error, thin, first, rings, neighbours]))
+
+    @property
+    def plan(self) -> Plan:
+        """What the cells agree on."""
+        if self._plan is None:
+            with np.load(self.work / "plan.npz") as data:
+                diagonal, variance, spacing, error, *whole = data["numbers"].tolist()
+                thin, first, rings, neighbours = map(int, whole)
+                self._plan = Plan(data["origin"], diagonal, Noise(variance, spacing), error, thin, first, data["cuts"],
+                                  rings, neighbours)
+        return self._plan
+
+    @property
+    def runs(self) -> Runs:
+        """The points on disk."""
+        if self._runs is None:
+            self._runs = Runs(self.work / "runs", self.lattice())
+        return self._runs
+
+    def make_coarse(self) -> None:
+        """Make the levels before the cells' from the thinned copy."""
+        path = self.work / "coarse.npz"
+        if not path.exists():
+            coarse = build_coarse(self.runs, self.plan, self.options, self.device)
+            _write_surface(path, coarse.surface, copy_points=coarse.points, copy_normals=coarse.normals)
+            self.device.trim()
+
+    def check(self, number: int, points=None) -> None:
+        """Compare the coarse leaves with all points of a cell."""
+        path = self.work / "checks" / f"{number:05d}.npz"
+        if path.exists():
+            return
+        points = cell_points(self.runs, self.plan, number, halo=False) if points is None else points
+        near, sums = check_cell(points, self.plan, self._made_coarse(), self.device)
+        _write_arrays(path, near=near, sums=sums)
+
+    def join_checks(self) -> None:
+        """Write the coarse part with the leaves that fit all points."""
+        if part_folder(self.folder, 0).exists():
+            return
+        coarse = self._made_coarse().surface
+        sums = np.zeros((len(coarse), 2))
+        for number in range(self.plan.cells):
+            with np.load(self.work / "checks" / f"{number:05d}.npz") as data:
+                sums[data["near"]] += data["sums"]
+        surface = checked(coarse, sums, self.plan, self.options)
+        self._describe(0, surface, np.zeros(0, np.float32))
+        write_part(self.folder, 0, surface)
+
+    def run_written(self, number: int) -> bool:
+        """Return whether run `number` is there."""
+        return chunk_written(self.work / "runs", number)
+
+    def check_written(self, number: int) -> bool:
+        """Return whether cell `number` has been checked."""
+        return (self.work / "checks" / f"{number:05d}.npz").exists()
+
+    def cell_written(self, number: int) -> bool:
+        """Return whether cell `number` is there."""
+        return part_folder(self.folder, number + 1).exists()
+
+    def build(self, number: int, points=None) -> None:
+        """Build cell `number` and write it as part number + 1."""
+        if self.cell_written(number):
+            return
+        points = cell_points(self.runs, self.plan, number) if points is None else points
+        surface, distance = build_cell(points, self.plan, self.options, self._checked_coarse(), self.device)
+        self._describe(number + 1, surface, distance)
+        write_part(self.folder, number + 1, surface)
+        give_back()
+
+    def finish(self, out: Path) -> None:
+        """Write the index, drop what only the build needed, and give the folder its name."""
+        about = []
+        for number in range(self.plan.cells + 1):
+            with np.load(self.work / "parts" / f"{number:05d}.npz") as data:
+                about.append({name: data[name] for name in data.files})
+        bounds, surfels = (np.stack([one[name] for one in about]) for name in ("bounds", "surfels"))
+        distance = np.concatenate([one["distance"] for one in about])
+        bound = float(np.quantile(distance, BOUND_SHARE)) if len(distance) else float("nan")
+        values = {"degree": self.options.degree, "error": self.plan.error, "diagonal": self.plan.diagonal,
+                  "bound": bound if np.isfinite(bound) else None, "bound_share": BOUND_SHARE, "oriented": True,
+                  "parts": len(about), "leaves": int(sum(one["leaves"] for one in about)),
+                  "colored": bool(all(one["colored"] for one in about))}
+        write_index(self.folder, values, bounds, surfels)
+        shutil.rmtree(self.work)
+        (self.folder / "job.json").unlink()
+        if out.is_dir():
+            shutil.rmtree(out)
+        os.replace(self.folder, out)
+
+    def _describe(self, part: int, surface, distance: NDArray) -> None:
+        """Write what the index says of a part, before the part itself."""
+        surfels = np.bincount(surface.level, minlength=LEVELS + 1)[1:]
+        _write_arrays(self.work / "parts" / f"{part:05d}.npz", bounds=surface.bounds, surfels=surfels,
+                      leaves=surface.leaf.sum(), colored=surface.colors is not None, distance=distance)
+
+    # What was made ------------------------------------------------------------------------------------------------
+
+    def _made_coarse(self) -> Coarse:
+        if self._coarse is None:
+            with np.load(self.work / "coarse.npz") as data:
+                arrays = {name: data[name] for name in data.files}
+            values = json.loads(bytes(arrays.pop("values")).decode())
+            points, normals = arrays.pop("copy_points"), arrays.pop("copy_normals")
+            self._coarse = Coarse(from_arrays("slim", arrays, values), points, normals)
+        return self._coarse
+
+    def _checked_coarse(self) -> Coarse:
+        if self._checked is None:
+            coarse = self._made_coarse()
+            self._checked = Coarse(load_part(self.folder, 0), coarse.points, coarse.normals)
+        return self._checked
+
+
+def load_part(folder: Path, number: int):
+    """Return part `number` of an unfinished surface."""
+    return load_store(part_folder(folder, number))
+
+
+def _write_arrays(path: Path, **arrays: NDArray) -> None:
+    path.parent.mkdir(exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    with open(temporary, "wb") as file:
+        np.savez(file, **arrays)
+    os.replace(temporary, path)
+
+
+def _write_surface(path: Path, surface, **more: NDArray) -> None:
+    _, arrays, values = to_arrays(surface)
+    _write_arrays(path, values=np.frombuffer(json.dumps(values).encode(), np.uint8), **arrays, **more)
+
+
+def begin(path, out: Path, options: Options, sizes: Sizes, device: Device) -> Build:
+    """Return the build in OUT.part: the one that was begun there with the same scan and options, or a new one."""
+    folder = out.with_name(out.name + ".part")
+    stat = Path(path).stat()
+    job = {"version": VERSION, "source": {"path": str(Path(path).resolve()), "size": stat.st_size,
+                                          "modified": stat.st_mtime_ns},
+           "options": asdict(options), "sizes": asdict(sizes)}
+    text = json.dumps(job)
+    old = folder / "job.json"
+    if folder.exists() and (not old.exists() or old.read_text() != text):
+        if not (old.exists() or not any(folder.iterdir())):
+            raise InputError(f"{folder}: expected an unfinished build or nothing, got a folder of other files: move it")
+        log.info("%s: of another scan or of other options: begun anew", folder)
+        shutil.rmtree(folder)
+    elif folder.exists():
+        log.info("%s: going on with it", folder)
+    (folder / "work" / "runs").mkdir(parents=True, exist_ok=True)
+    write_whole(old, text.encode())
+    return Build(folder, device)
+
+
+def build_streamed(path, out, degree=2, error="auto", tolerance=None, memory_limit=None, report=lambda *_: None,
+                   device=None, scheduler=None) -> Path:
+    """Build a SLIM surface from a file larger than memory; return the folder of its store.
+
+    Parameters
+    ----------
+    report : callable
+        report(stage, done) with done from 0 to 1; may raise to stop: what is done stays in OUT.part.
+    scheduler : str or distributed.Client, optional
+        Workers that take the steps; see `distributed`.
+    """
+    name = device if isinstance(device, str) else None  # of the workers' device
+    device, out = open_device(device), Path(out)
+    out = out if out.is_dir() else writable_place(out)
+    sizes = sizes_of(memory_limit)
+    source = open_source(path, sizes.chunk)
+    options = Options(int(degree), error if error == "auto" else float(error), tolerance, _orient(source))
+    build = begin(path, out, options, sizes, device)
+    kept = device.keep(sizes.cell * KEPT_PER_POINT)
+    steps = _Here(build, source) if scheduler is None else _cluster(scheduler, build, name)
+    try:
+        report("read", 0.0)
+        build.make_lattice(source)
+        steps.runs(range(source.chunks), report)
+        report("plan", 0.0)
+        build.make_plan()
+        build.make_coarse()
+        steps.checks(range(build.plan.cells), report)
+        build.join_checks()
+        steps.cells(range(build.plan.cells), report)
+        build.finish(out)
+        report("cells", 1.0)
+    finally:
+        steps.close()
+        device.keep(kept)
+        device.trim()
+    return out
+
+
+def _cluster(scheduler, build: Build, device: str | None):
+    from .distributed import OnCluster
+    return OnCluster(scheduler, build, device)
+
+
+def _orient(source: Source) -> str:
+    return "up" if source.airborne else "graph"
+
+
+class _Here:
+    """The steps one after the other in this process, with one thread that reads ahead."""
+
+    def __init__(self, build: Build, source: Source):
+        self.build, self.source = build, source
+
+    def close(self) -> None:
+        """Do nothing: no workers were started."""
+
+    def runs(self, numbers, report) -> None:
+        """Write the runs that are missing."""
+        folder, lattice = self.build.work / "runs", self.build.lattice()
+        missing = [number for number in numbers if not self.build.run_written(number)]
+        for done, (number, chunk) in enumerate(_ahead(missing, self.source.read)):
+            make_run(folder, number, self.source, lattice, chunk)
+            give_back()
+            report("read", (done + 1) / len(missing))
+
+    def checks(self, numbers, report) -> None:
+        """Check the coarse leaves against every cell."""
+        build = self.build
+        missing = [number for number in numbers if not build.check_written(number)]
+        for done, (number, points) in enumerate(_ahead(
+                missing, lambda number: cell_points(build.runs, build.plan, number, halo=False))):
+            build.check(number, points)
+            report("check", (done + 1) / len(missing))
+
+    def cells(self, numbers, report) -> None:
+        """Build the cells that are missing."""
+        build = self.build
+        missing = [number for number in numbers if not build.cell_written(number)]
+        for done, (number, points) in enumerate(_ahead(
+                missing, lambda number: cell_points(build.runs, build.plan, number))):
+            build.build(number, points)
+            report("cells", (done + 1) / (len(missing) + 1))
+
+
+def _ahead(numbers, read):
+    """Yield (number, read(number)), the next one being read meanwhile."""
+    with ThreadPoolExecutor(1) as pool:
+        waiting = [pool.submit(read, number) for number in numbers[:1]]
+        try:
+            for place, number in enumerate(numbers):
+                result = waiting.pop().result()
+                if place + 1 < len(numbers):
+                    waiting.append(pool.submit(read, numbers[place + 1]))
+                yield number, result
+                del result
+        finally:
+            for future in waiting:
+                future.cancel()
+                with contextlib.suppress(Exception):
+                    future.result()
+

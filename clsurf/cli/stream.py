@@ -1,0 +1,37 @@
+"""`clsurf build --memory`: scans larger than memory, in one process or on many."""
+
+from pathlib import Path
+
+from ..errors import InputError
+from .common import Steps, checked_out
+from .recipe import Recipe
+
+STAGES = {"read": "read", "plan": "plan", "check": "check coarse levels", "cells": "cells"}
+
+
+def checked_stream(how: Recipe, memory: str, scheduler: str, out: Path) -> Path:
+    """Return `out`, or raise InputError where a streamed build cannot have the recipe, the memory or the place."""
+    from ..build.slim import parse_bytes
+    if how.kind == "patches":
+        raise InputError(f"--{'memory' if memory else 'scheduler'}: an option of --kind slim, got --kind patches")
+    parse_bytes(memory or None)
+    if out.suffix.lower() != ".clsurf" or not out.is_dir():
+        checked_out(out, (".clsurf",))
+    return out
+
+
+def stream(scan: Path, out: Path, how: Recipe, memory: str, scheduler: str, device, steps: Steps) -> None:
+    """Build the surface of `scan` part by part; Ctrl-C leaves what is done, and says so."""
+    import clsurf
+    try:
+        with steps.step("build"):
+            surface = clsurf.build_slim(scan, **how.slim, memory_limit=memory or None, out=out, device=device,
+                                        scheduler=scheduler or None,
+                                        progress=lambda stage, done: steps.progress(STAGES.get(stage, stage), done))
+    except KeyboardInterrupt:
+        part = out.with_name(out.name + ".part")
+        if part.exists():
+            steps.say(f"stopped: {part} keeps what is done; the same command goes on with it")
+        raise
+    steps.say(f"  {surface}")
+    steps.say(f"surface: {out.resolve()}")

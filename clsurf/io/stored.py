@@ -1,0 +1,138 @@
+"""Surfaces that stay in their store: read in parts, from disk or over the network."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.storage import LocalStore, ZipStore
+
+from clsurf.errors import Error, FileFormatError, InputError
+from clsurf.surface.slim import SlimSurface
+
+from . import parts
+from .files import one_line
+from .layout import from_arrays
+
+# A store on the web cannot be listed.
+NAMES = ("centers", "radii", "normals", "normal_codes", "coefficients", "level", "leaf", "child_offset", "children",
+         "fit_error", "origin")
+OPTIONAL = ("footprint", "colors")
+
+
+class StoredSurface:
+    """A SLIM surface in a .clsurf store, of which parts are read as they are needed.
+
+    Parameters
+    ----------
+    place : path-like
+        A .clsurf folder or zip, or a URL of a folder that fsspec reads, such as "https://host/name.clsurf".
+
+    Attributes
+    ----------
+    degree, error, diagonal, bound, bound_share
+        As those of `SlimSurface`.
+    part_bounds : (k, 2, 3) float64
+        World boxes of the parts; part 0 holds the coarse levels of all.
+    surfels : (k, levels) int
+        How many each part has of every level.
+
+    Raises
+    ------
+    InputError, FileFormatError
+        No such store, or one that cannot be read.
+    """
+
+    def __init__(self, place):
+        self.place = str(place)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self._group = zarr.open_group(_store(self.place), mode="r", zarr_format=3)
+                about = dict(self._group.attrs)
+                self._single = about.get("kind") == "slim"
+                if about.get("format") != "clsurf" or about.get("kind") not in (parts.KIND, "slim"):
+                    raise FileFormatError(f"{place}: expected a SLIM surface in a .clsurf store, got "
+                                          f"{about.get('kind')!r}")
+                self._values = dict(about["values"])
+                self._describe()
+        except Error:
+            raise
+        except FileNotFoundError:
+            raise InputError(f"{place}: no such .clsurf store") from None
+        except Exception as error:
+            raise FileFormatError(f"{place}: damaged or no .clsurf store: {one_line(error)}") from error
+
+    def _describe(self) -> None:
+        values = self._values
+        self.degree, self.error, self.diagonal = int(values["degree"]), values["error"], float(values["diagonal"])
+        self.bound = float("nan") if values.get("bound") is None else float(values["bound"])
+        self.bound_share = float(values.get("bound_share", 1.0))
+        if self._single:
+            whole = self.read(0)
+            self.part_bounds = whole.bounds[None]
+            self.surfels = np.bincount(whole.level, minlength=26)[None, 1:]
+            self.colored, self.origin = whole.colors is not None, whole.origin
+        else:
+            self.part_bounds, self.surfels = self._group["bounds"][...], self._group["surfels"][...]
+            self.colored = bool(values.get("colored"))
+            self.origin = self._group["parts/00000/origin"][...]
+
+    @property
+    def bounds(self) -> NDArray:
+        """Bounding box (2, 3) float64, world space."""
+        return np.stack([np.nanmin(self.part_bounds[:, 0], axis=0), np.nanmax(self.part_bounds[:, 1], axis=0)])
+
+    def __len__(self):
+        return int(self.surfels.sum())
+
+    def read(self, part: int, levels: int | None = None) -> SlimSurface:
+        """Return a part as a surface of its own, or its surfels of the levels up to `levels` only."""
+        group = self._group if self._single else self._group[f"parts/{part:05d}"]
+        values = dict(group.attrs["values"])
+        rows = None if levels is None or self._single else int(self.surfels[part, :levels].sum())
+        names = [*NAMES, *(name for name in OPTIONAL if name in group)]
+        if rows is None:
+            return from_arrays("slim", {name: group[name][...] for name in names}, values)
+        whole = ("origin", "child_offset", "children")
+        arrays = {name: group[name][...] if name == "origin" else group[name][:rows]
+                  for name in names if name not in whole[1:]}
+        offset = group["child_offset"][:rows + 1]
+        children = group["children"][:int(offset[-1])]
+        keep = children < rows
+        arrays["child_offset"] = np.concatenate([[0], np.cumsum(keep)])[offset].astype(np.int32)
+        arrays["children"] = children[keep]
+        return from_arrays("slim", arrays, values)
+
+    def load(self) -> SlimSurface:
+        """Return the whole surface."""
+        if self._single:
+            return self.read(0)
+        return parts.joined([self.read(part) for part in range(len(self.surfels))], self._values)
+
+    def __repr__(self):
+        low, high = self.bounds
+        return (f"StoredSurface(degree {self.degree}, {len(self):,} surfels in {len(self.surfels)} parts, "
+                f"{self.place!r}, bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
+
+    def __reduce__(self):
+        return StoredSurface, (self.place,)
+
+
+def _store(place: str):
+    if "://" in place:
+        try:
+            from zarr.storage import FsspecStore
+            return FsspecStore.from_url(place, read_only=True)
+        except ImportError as error:
+            raise InputError(f"{place}: needs fsspec: pip install clsurf[scale] ({one_line(error)})") from None
+    path = Path(place).expanduser()
+    if not path.exists():
+        raise InputError(f"{place}: no such .clsurf store")
+    return LocalStore(path, read_only=True) if path.is_dir() else ZipStore(path, mode="r")
+
+
+def open_surface(place) -> StoredSurface:
+    """Open a SLIM surface in a .clsurf store without reading it whole; see `StoredSurface`."""
+    return StoredSurface(place)

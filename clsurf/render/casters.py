@@ -1,0 +1,112 @@
+"""What hides lamps from the points of a picture: everything that can be traced casts.
+
+Kinds with packets (`clsurf.trace.kinds.Traced.packets`) cast by packets from the lamps, all others by a single ray from
+each point. Kernels: kernels/trace/trace_lights.cl; kernels/trace/lamp_rays.cl, lamp_bits.cl.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device, DeviceArray
+from ..trace.kinds import ANY, Traced, traceable, traced
+from ..trace.packets import packet_lanes, trace_lights
+from ..trace.single import HIT_FLOATS, RAY_FLOATS, placement
+from .tiles import Grid, Scratch, view_floats
+
+HEADLIGHT = 0  # a lamp's kind: at the eye
+STEPS = 1.5  # grains of a caster that single rays start above the points: in a cell of patches they meet two triangles
+CHUNK = 1 << 17  # rays of one launch
+
+
+@dataclass(frozen=True, eq=False)
+class Caster:
+    """One surface of a scene as an obstacle, placed, seen by the picture's camera."""
+
+    held: Traced
+    view: DeviceArray | None  # of kinds with packets: the view buffer (kernels/common/view.clh)
+    place: DeviceArray  # (13,) float32: view space to the surface's frame, row by row; world length of a frame's unit
+    step: float  # world units within which the surface's own points are no obstacles
+
+
+@dataclass(frozen=True, eq=False)
+class Casters:
+    """All obstacles of a picture, those with packets first; `pixels`: where it shows something."""
+
+    packets: list[Caster]
+    singles: list[Caster]
+    view: DeviceArray  # of the camera
+    pixels: DeviceArray  # int32: bin * 64 + pixel; filled for `singles` only
+
+
+def casters_of(device: Device, grid: Grid, scene, camera) -> Casters:
+    """Return what casts in a scene whose bins are drawn."""
+    packets, singles = [], []
+    for surface, matrix in scene.placed:
+        if not traceable(surface):
+            continue
+        held = traced(device, surface)
+        if held.empty:
+            continue
+        matrix = np.eye(4) if matrix is None else matrix
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        back = placement(held, matrix)
+        linear, zero = back[:12].reshape(3, 4)[:, :3], back[:12].reshape(3, 4)[:, 3]
+        place = np.hstack([linear @ camera.rotation.T, (linear @ camera.eye + zero)[:, None]])
+        place = device.upload(np.append(place.ravel(), back[12]).astype(np.float32))
+        view = None if held.packets is None else device.upload(
+            occluder_view(held.packets.origin, matrix, camera, grid.size))
+        (singles if view is None else packets).append(Caster(held, view, place, STEPS * scale * held.grain))
+    pixels = np.zeros(0, np.int32)
+    if singles:
+        depth = device.download(grid.planes, copy=False)[:, 0]
+        seen = (depth < np.inf) & (device.download(grid.touched, copy=False) >= 0)[:, None]
+        pixels = np.flatnonzero(seen).astype(np.int32)
+    return Casters(packets, singles, device.upload(view_floats(camera, grid.size)), device.upload(pixels))
+
+
+def cast(device: Device, scratch: Scratch, grid: Grid, casters: Casters, lamps: NDArray, reach: float,
+         mask: DeviceArray, words: int, word: int) -> None:
+    """Fill word `word` of the mask (bins, words, 64) uint32 with the lamps that are hidden by any of the casters.
+
+    Parameters
+    ----------
+    lamps : (n, 8) float32
+        At most 32: kind (0: at the eye, 1: directional, 2: point), then the direction to it or its place, view space.
+    reach : float
+        World units: what lies farther than this before a point does not count; inf: everything counts.
+    """
+    if not casters.packets or not len(lamps):
+        device.fill(mask, 0)
+    if not len(lamps):
+        return
+    on_device = device.upload(np.ascontiguousarray(lamps, np.float32))
+    for i, caster in enumerate(casters.packets):
+        trace_lights(device, packet_lanes(scratch.lanes), caster.held.packets, caster.view, grid.layout.constants,
+                     on_device, len(lamps), reach, i == 0, grid.bins_x, grid.bins_y, grid.touched, grid.planes, mask,
+                     64 * words, 64 * word)
+    count = casters.pixels.shape[0]
+    if not casters.singles or not count:
+        return
+    rays = scratch.array("lamp_rays", (min(count, CHUNK), RAY_FLOATS), np.float32)
+    hits = scratch.array("lamp_hits", (min(count, CHUNK), HIT_FLOATS), np.float32)
+    make = device.kernel("trace/lamp_rays.cl", constants=grid.layout.constants)
+    take = device.kernel("trace/lamp_bits.cl")
+    for first in range(0, count, CHUNK):
+        part = min(CHUNK, count - first)
+        for caster in casters.singles:
+            for lamp in np.flatnonzero(lamps[:, 0] != HEADLIGHT):
+                make((part,), (64,), part, first, casters.pixels, casters.view, caster.place, on_device, lamp,
+                     caster.step, reach, grid.bins_x, grid.planes, mask, 64 * words, 64 * word, rays)
+                caster.held.launch(ANY, part, rays, hits)
+                take((part,), (64,), part, first, casters.pixels, hits, lamp, mask, 64 * words, 64 * word)
+
+
+def occluder_view(origin: NDArray, matrix: NDArray | None, camera, size) -> NDArray:
+    """Return the view buffer (kernels/common/view.clh) of a placed surface, `origin` its model's zero, that casts."""
+    matrix = np.eye(4) if matrix is None else matrix
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    zero = matrix[:3, :3] @ origin + matrix[:3, 3]
+    return view_floats(camera, size, camera.rotation @ (matrix[:3, :3] / scale), camera.rotation @ (zero - camera.eye),
+                       scale)
