@@ -4,9 +4,12 @@ import weakref
 
 import numpy as np
 import pytest
+from test_render_clip import CAMERAS, PLANES, check
 from test_render_triangles import globe
 
+from clsurf.build.scale_map import build_scale_map
 from clsurf.build.slim import build_slim
+from clsurf.build.surfels import build_surfels
 from clsurf.models import perfect_sphere
 from clsurf.models.basic import sphere
 from clsurf.render.camera import Camera
@@ -21,14 +24,18 @@ DIAGONAL = 2 * np.sqrt(3)  # of the unit sphere's box
 # No node drawn as it is, and none of a coarser level: what a bound says something about.
 EXACT = PatchDrawing(direct=False, mip=False)
 
+SAG = 1 - np.cos(np.pi / 160) ** 2  # of the mesh's facets, two edges wide
+
 # A unit sphere about the origin in every kind, and how far the drawn surface is from it at most, as its makers state:
-# a mesh's facets sag by 1 - cos of half an edge's angle, a cloud's discs by half their radius squared, patches are a
-# hundredth of a node off by their steps, SLIM surfaces say it themselves.
+# facets sag, a cloud's discs and surfels by half their radius squared, patches are a hundredth of a node off by their
+# steps, a scale map adds the sag of its texels to its mesh's, SLIM surfaces say it themselves.
 SPHERES = {
-    "slim": lambda: with_bound(build_slim(sphere(20_000), error=0.0003)),
-    "patches": lambda: (perfect_sphere(radius=1.0), 1e-4),
-    "mesh": lambda: (globe(80, 160), 1 - np.cos(np.pi / 160) ** 2),
-    "cloud": lambda: (sphere(20_000), 0.5 * 0.034 ** 2 + 1e-4),
+    "slim": lambda device: with_bound(build_slim(sphere(20_000), error=0.0003, device=device)),
+    "patches": lambda _: (perfect_sphere(radius=1.0), 1e-4),
+    "mesh": lambda _: (globe(80, 160), SAG),
+    "cloud": lambda _: (sphere(20_000), 0.5 * 0.034 ** 2 + 1e-4),
+    "surfels": lambda device: (build_surfels(sphere(20_000), device=device), 0.5 * 0.034 ** 2),
+    "scale map": lambda device: (build_scale_map(globe(80, 160), bits=16, device=device), 2 * SAG),
 }
 
 
@@ -37,9 +44,9 @@ def with_bound(surface):
 
 
 @pytest.fixture(scope="module")
-def spheres():
+def spheres(device):
     """(surface, bound) by kind."""
-    return {name: make() for name, make in SPHERES.items()}
+    return {name: make(device) for name, make in SPHERES.items()}
 
 
 @pytest.mark.parametrize("lanes", (16, 1))
@@ -155,3 +162,12 @@ def test_instances_share_uploads(device, spheres, kind):
     assert sizes[0] > surface.nbytes / 2
     assert sizes[1] <= 1.15 * sizes[0]
     assert set(np.unique(frame.id)) == set(range(-1, 10))
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+@pytest.mark.parametrize("planes", ("oblique", "facing", "two", "all"))
+@pytest.mark.parametrize("kind", ("mesh", "cloud"))
+def test_scans_show_their_inside(device, spheres, kind, planes, lanes):
+    """Clip planes cut triangles and discs at every pixel."""
+    with Renderer(device, lanes=lanes) as renderer:
+        check(renderer, spheres[kind][0], CAMERAS["perspective"], PLANES[planes], 0.02, 0.15)
