@@ -16,6 +16,10 @@ JOBS = {
     "normals": "neighbours, normals and their orientation",
     "curvature": "curvature at points: error and time on tori, MeshLab's filters",
     "smooth": "smoothing of noisy meshes: errors against the true shape, time, Taubin's method",
+    "fuzz": "damaged files of every format: crashes, hangs, memory",
+    "devices": "one answer everywhere: hashes of all devices' answers and how far they are apart",
+    "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",
+    "stream": "scans larger than memory: time, peak memory, autzen's points within 0.3 m, scaling to 50 million points",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 

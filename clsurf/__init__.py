@@ -16,35 +16,46 @@ from .analysis.sparsity import slim_of_error, sparsity
 from .build.normals import estimate_normals
 from .build.patches import build_patches
 from .build.project import Projection, project
+from .build.scale_map import build_scale_map
 from .build.slim import build_slim
+from .build.surfels import build_surfels
 from .device import Device, Profile, open_device
 from .errors import Error
 from .io import load, load_frames, save
 from .io.stored import StoredSurface
 from .io.stored import open_surface as open
+from .io.video import write_video
 from .render.camera import Camera
+from .render.camera_path import CameraPath, load_cameras, render_frames, save_cameras, turntable
 from .render.frame import Frame
 from .render.patch_drawing import PatchDrawing
 from .render.renderer import Renderer, render
+from .render.scale_map_drawing import ScaleMapDrawing
 from .render.scene import Scene
 from .render.shade import Light, Shading
 from .render.slim_drawing import SlimDrawing
+from .render.surfel_drawing import SurfelDrawing
 from .report.page import report
 from .surface.cloud import PointCloud
 from .surface.mesh import Mesh
 from .surface.patch import PatchSurface
 from .surface.placed import Placed
 from .surface.ranges import RangeImage, RangeScan
+from .surface.scale_map import ScaleMap
 from .surface.slim import SlimSurface
+from .surface.surfel import SurfelHierarchy
 from .trace.hits import Hits, trace
+from .view.canvas import view
+from .view.viewer import Viewer
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Camera", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing",
-    "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer", "Scene",
-    "Shading", "SlimDrawing", "SlimSurface", "StoredSurface", "SurfaceError", "build_patches", "build_slim",
+    "Camera", "CameraPath", "Curvature", "Device", "Error", "Frame", "Hits", "Light", "Lines", "Mesh", "PatchDrawing",
+    "PatchSurface", "Placed", "PointCloud", "Profile", "Projection", "RangeImage", "RangeScan", "Renderer",
+    "ScaleMap", "ScaleMapDrawing", "Scene", "Shading", "SlimDrawing", "SlimSurface", "StoredSurface", "SurfaceError",
+    "SurfelDrawing", "SurfelHierarchy", "Viewer", "build_patches", "build_scale_map", "build_slim", "build_surfels",
     "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels", "line_surface", "lines", "load",
-    "load_frames", "models", "open", "open_device", "project", "render", "report", "save", "slim_of_error", "smooth",
-    "sparsity", "trace",
+    "load_cameras", "load_frames", "models", "open", "open_device", "project", "render", "render_frames", "report",
+    "save", "save_cameras", "slim_of_error", "smooth", "sparsity", "trace", "turntable", "view", "write_video",
 ]

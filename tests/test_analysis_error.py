@@ -6,8 +6,9 @@ import trimesh
 
 from clsurf import models
 from clsurf.analysis.error import SurfaceError, error, surface_samples
-from clsurf.analysis.triangles import triangle_distances
+
 from clsurf.build.patches import build_patches
+from clsurf.build.triangles import nearest_triangles, triangle_distances
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh

@@ -24,7 +24,10 @@ from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
 from ..surface.placed import Placed
 from ..surface.ranges import RangeScan
+from ..surface.scale_map import ScaleMap
+from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy, finest_scan
 from . import risk
 from .quartics import RADIUS_RATIO, SurfelTree, evaluate, fit_surfels
 from .scan_points import scan_points
@@ -85,9 +88,10 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
 
     Parameters
     ----------
-    thing : Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, Placed, str or PathLike
+    thing : Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Placed, str or PathLike
         A path is read with `clsurf.load`. Normals say which way is out: they are taken from the scan, computed from the
-        faces, or estimated, in this order. Of a PatchSurface its opaque nodes are taken as a scan.
+        faces, or estimated, in this order. Of a PatchSurface its opaque nodes, of a SurfelHierarchy its base surfels or
+        its mesh, of a ScaleMap its valid texels are taken as a scan.
     points : (n, 3) array_like, optional
         World positions; the nearest place of the surface is measured. By default the scan's own points in their order,
         or the centres of a SLIM surface's leaves.
@@ -126,11 +130,15 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
         return _of_slim(thing, points, radius, report, device)
     if isinstance(thing, PatchSurface):
         thing = patch_mesh(thing)
+    if isinstance(thing, SurfelHierarchy):
+        thing = finest_scan(thing)
+    if isinstance(thing, ScaleMap):
+        thing = scale_mesh(thing)
     if isinstance(thing, RangeScan):
         thing = thing.to_points()
     if not isinstance(thing, Mesh | PointCloud):
-        raise InputError("curvature: expected a Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, one of these "
-                         f"placed, or a path, got {type(thing).__name__}")
+        raise InputError("curvature: expected a Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, "
+                         f"SurfelHierarchy, ScaleMap, one of these placed, or a path, got {type(thing).__name__}")
     return _of_scan(thing, points, radius, report, device)
 
 

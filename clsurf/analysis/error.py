@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..build.project import project
 from ..build.radius import robust_box
+from ..build.triangles import triangle_distances
 from ..device import open_device
 from ..errors import InputError
 from ..io import load
@@ -22,9 +23,12 @@ from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
 from ..surface.placed import Placed
 from ..surface.ranges import RangeScan
+from ..surface.scale_map import ScaleMap
+from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import SlimSurface, frame_of_normals
-from .triangles import triangle_distances
+from ..surface.surfel import SurfelHierarchy
 
+MEASURED = SlimSurface | PatchSurface | SurfelHierarchy | ScaleMap
 ALPHA = 2 / 3  # of a ball's radius: the part that carries the surface
 
 
@@ -35,7 +39,7 @@ class SurfaceError:
     Attributes
     ----------
     distance : (n,) float64
-        From every finite point of the scan to the surface. From SLIM surfaces signed, positive on the side that the
+        From every finite point of the scan to the surface. From SLIM surfaces and surfel hierarchies signed, positive on the side that the
         normals point to; from meshes and patches 0 or more.
     diagonal : float
         Of the scan's bounding box without outliers, world units: what `relative` divides by.
@@ -92,8 +96,9 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
 
     Parameters
     ----------
-    surface : SlimSurface, PatchSurface, Mesh or Placed
-        SLIM surfaces are projected onto (see `project`); of patches, the triangles between opaque nodes count.
+    surface : SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh or Placed
+        SLIM surfaces and hierarchies are projected onto (see `project`); of patches, the triangles between opaque nodes
+        count, of scale maps those between valid texels.
     scan : Mesh, PointCloud, RangeScan, (n, 3) array_like of world positions, or the path of a scan
         Points that are not finite are left out.
     both : bool
@@ -112,8 +117,9 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
         A scan without finite points, a surface without leaves or faces, or `both` without triangles in the scan.
     """
     scan = _as_scan(scan)
-    if not isinstance(surface.surface if isinstance(surface, Placed) else surface, SlimSurface | PatchSurface | Mesh):
-        raise InputError(f"surface: expected a SlimSurface, a PatchSurface or a Mesh, got {type(surface).__name__}")
+    if not isinstance(surface.surface if isinstance(surface, Placed) else surface, MEASURED | Mesh):
+        raise InputError("surface: expected a SlimSurface, a PatchSurface, a SurfelHierarchy, a ScaleMap or a Mesh, got "
+                         f"{type(surface).__name__}")
     if both and not (isinstance(scan, Mesh) and len(scan.faces)):
         raise InputError("both: expected a scan with faces to measure the surface's points against, got points only")
     device = open_device(device)
@@ -137,7 +143,7 @@ def _as_scan(scan) -> Mesh | PointCloud:
         return scan.to_points()
     if isinstance(scan, Mesh | PointCloud):
         return scan
-    if isinstance(scan, SlimSurface | PatchSurface | Placed):
+    if isinstance(scan, MEASURED | Placed):
         raise InputError(f"scan: expected a scan, got a surface ({type(scan).__name__})")
     try:
         points = np.asarray(scan, np.float64)
@@ -154,14 +160,15 @@ def distances(surface, points: NDArray, device) -> NDArray:
     if isinstance(surface, Placed):
         linear, scale = surface.matrix[:3, :3], surface.scale
         return scale * distances(surface.surface, (points - surface.matrix[:3, 3]) @ linear / scale**2, device)
-    if isinstance(surface, SlimSurface):
+    if isinstance(surface, SlimSurface | SurfelHierarchy):
         return project(surface, points, device=device).distance
     mesh = _as_mesh(surface)
     return triangle_distances(mesh.vertices, mesh.faces, points - mesh.origin, device)
 
 
 def _as_mesh(surface) -> Mesh:
-    mesh = patch_mesh(surface) if isinstance(surface, PatchSurface) else surface
+    mesh = patch_mesh(surface) if isinstance(surface, PatchSurface) else \
+        scale_mesh(surface) if isinstance(surface, ScaleMap) else getattr(surface, "mesh", surface)
     if not len(mesh.faces):
         raise InputError("surface: expected a mesh with faces, got none")
     return mesh
@@ -178,6 +185,8 @@ def surface_samples(surface, count: int, device) -> NDArray:
     random = np.random.default_rng(0)
     if isinstance(surface, SlimSurface):
         return project(surface, _disc_points(surface, count, random), device=device).position
+    if isinstance(surface, SurfelHierarchy) and not surface.hybrid:
+        return project(surface, _base_points(surface, count, random), device=device).position
     mesh = _as_mesh(surface)
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     area = np.nan_to_num(np.linalg.norm(np.cross(b - a, c - a), axis=1))
@@ -188,6 +197,20 @@ def surface_samples(surface, count: int, device) -> NDArray:
     over = u + v > 1
     u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
     return a[face] + u * (b - a)[face] + v * (c - a)[face] + mesh.origin
+
+
+def _base_points(surface: SurfelHierarchy, count: int, random) -> NDArray:
+    """Return random world points (n, 3) of the base surfels' discs of alpha r, as many a unit of area everywhere."""
+    base = surface.base
+    area = np.nan_to_num(surface.radii[base]).astype(np.float64) ** 2
+    if not area.sum() > 0:
+        raise InputError("surface: expected at least one base surfel, got none")
+    chosen = base[random.choice(len(base), count, p=area / area.sum())]
+    reach = ALPHA * surface.radii[chosen] * np.sqrt(random.uniform(size=count))
+    angle = random.uniform(0, 2 * np.pi, count)
+    u, v = frame_of_normals(surface.normals[chosen].astype(np.float64))
+    return (surface.positions[chosen] + (reach * np.cos(angle))[:, None] * u + (reach * np.sin(angle))[:, None] * v
+            + surface.origin)
 
 
 def _disc_points(surface: SlimSurface, count: int, random) -> NDArray:

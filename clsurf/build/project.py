@@ -1,4 +1,4 @@
-"""Nearest points of a SLIM surface."""
+"""Nearest points of surfaces."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,12 @@ from ..device import Device, open_device
 from ..device.arrays import DeviceArray
 from ..errors import InputError
 from ..surface.placed import Placed
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface, frame_of_normals
+from ..surface.surfel import SurfelHierarchy
 from .point_tree import BLOCK, build_boxes, column_bounds, morton_order
+from .project_scale_map import project_scale_map
+from .project_surfels import project_surfels
 
 LEAF = 24  # floats a leaf (project_points.cl)
 BATCH = 1 << 22  # queries of one launch
@@ -55,12 +59,12 @@ class LeafTree:
 
 
 def project(surface, points, device=None) -> Projection:
-    """Project points onto a SLIM surface.
+    """Project points onto a surface.
 
     Parameters
     ----------
-    surface : SlimSurface or Placed
-        Its leaves are used.
+    surface : SlimSurface, SurfelHierarchy, ScaleMap or Placed
+        A SLIM surface's leaves are used; of a hierarchy the base surfels, blended, or the triangles.
     points : (n, 3) array_like
         World positions, float64.
     device : None, str or Device
@@ -68,7 +72,8 @@ def project(surface, points, device=None) -> Projection:
     Returns
     -------
     Projection
-        Points far from the surface (against its radius of curvature) get a near point, not always the nearest.
+        Points far from the surface (against its radius of curvature) get a near point, not always the nearest. On a
+        scale map the nearest point to second order in the texels' size; normals point outward.
 
     Raises
     ------
@@ -89,8 +94,13 @@ def project(surface, points, device=None) -> Projection:
         near = project(surface.surface, local, device)
         return Projection(near.position @ linear.T + surface.matrix[:3, 3], near.normal @ linear.T / scale,
                           near.distance * scale)
+    if isinstance(surface, SurfelHierarchy):
+        return Projection(*project_surfels(surface, points, open_device(device)))
+    if isinstance(surface, ScaleMap):
+        return Projection(*project_scale_map(surface, points, open_device(device)))
     if not isinstance(surface, SlimSurface):
-        raise InputError(f"surface: expected a SlimSurface, got {type(surface).__name__}")
+        raise InputError("surface: expected a SlimSurface, a SurfelHierarchy or a ScaleMap, got "
+                         f"{type(surface).__name__}")
     device = open_device(device)
     tree = leaf_tree(surface, device)
     shift = surface.origin + tree.middle

@@ -1,5 +1,5 @@
-"""The command line: `clsurf demo | devices | doctor | info | build | convert | render | trace | report | smooth |
-curvature | bench`.
+"""The command line: `clsurf demo | devices | doctor | info | build | convert | render | view | trace | report |
+smooth | curvature | bench`.
 
 Bad input ends with one line and exit code 2, never with a traceback; long work shows a bar on a terminal and a plain
 line per step elsewhere.
@@ -18,11 +18,12 @@ from .machine import bench, devices, doctor
 from .pictures import demo, render, report
 from .smooth import smooth
 from .trace import trace
+from .view import view
 
 app = typer.Typer(name="clsurf", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Compact surface models from scans, drawn on any OpenCL device.",
                   context_settings={"help_option_names": ["-h", "--help"]})
-for command in (demo, devices, doctor, info, build, convert, render, trace, report, smooth, curvature, bench):
+for command in (demo, devices, doctor, info, build, convert, render, view, trace, report, smooth, curvature, bench):
     app.command()(command)
 
 

@@ -48,15 +48,22 @@ class LinePicture:
         return tuple(dict.fromkeys((*wanted, "depth", "normal",
                                     *(clsurf.line_channels(self.kinds) if alone else ()))))
 
+    def found(self, frame, coarse, camera, size, device):
+        """Return the lines of `coarse`, None where they are those of `frame` itself."""
+        import clsurf
+        if coarse is None:
+            return clsurf.lines(frame, self.kinds, device=device)
+        other = clsurf.render(coarse, camera, size, clsurf.line_channels(self.kinds), device=device)
+        return clsurf.lines(other, self.kinds, silhouette=frame, device=device)
+
+    def over(self, frame, coarse, camera, size, device):
+        """Return `frame`, or white, with the lines drawn over it."""
+        return self.found(frame, coarse, camera, size, device).draw(None if self.on_white else frame)
+
     def save(self, out: Path, frame, coarse, camera, size, device, steps: Steps) -> None:
         """Find the lines of `coarse`, None where they are those of `frame` itself, and write the picture."""
-        import clsurf
         with steps.step("find lines"):
-            if coarse is None:
-                found = clsurf.lines(frame, self.kinds, device=device)
-            else:
-                other = clsurf.render(coarse, camera, size, clsurf.line_channels(self.kinds), device=device)
-                found = clsurf.lines(other, self.kinds, silhouette=frame, device=device)
+            found = self.found(frame, coarse, camera, size, device)
         steps.say(f"  {found}")
         with steps.step("write"):
             if out.suffix.lower() == ".svg":

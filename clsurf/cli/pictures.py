@@ -12,6 +12,15 @@ from .color_maps import ChannelOption, LegendOption, LimitOption, channel_pictur
 from .common import PICTURES, DeviceOption, ProfileOption, QuietOption, SizeOption, Steps, checked_out, parsed_size
 from .lights import LightOption, MirrorOption, OcclusionOption, ShadowsOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
+from .motion import (
+    CameraOption,
+    FpsOption,
+    FramesOption,
+    IgnoreOption,
+    PathOption,
+    TurntableOption,
+    motion,
+)
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, Recipe, SpacingOption, parsed_error, recipe
 
 SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
@@ -59,9 +68,13 @@ def demo(out: Annotated[Path, typer.Argument(help="Picture to write: .png, .jpg,
 
 
 def render(source: SourceArgument,
-           out: Annotated[Path, typer.Argument(help="Picture: .png, .jpg, or .exr with every channel.")],
-           size: SizeOption = "1024x768", direction: DirectionOption = "", up: UpOption = "0,1,0",
+           out: Annotated[Path, typer.Argument(help="Picture: .png, .jpg, or .exr with every channel; with "
+                                               "--turntable or --path .mp4, .gif, .webp or a folder.")],
+           size: Annotated[str, typer.Option(help="Picture size [1024x768, or that of --camera or --path].")] = "",
+           direction: DirectionOption = "", up: UpOption = "0,1,0",
            fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
+           turntable: TurntableOption = None, path: PathOption = None, frames: FramesOption = None,
+           fps: FpsOption = 30.0, camera: CameraOption = "", ignore_distortion: IgnoreOption = False,
            channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id, and "
                                                       "those of --channel; .png and .jpg show "
                                                       "color.")] = "color,depth,normal",
@@ -73,17 +86,20 @@ def render(source: SourceArgument,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, profile: ProfileOption = False, device: DeviceOption = "",
            quiet: QuietOption = False):
-    """Draw a surface or a scan into a picture."""
+    """Draw a surface or a scan into a picture, or into a moving one."""
     import clsurf
 
     from ..device import Profile
     from ..render.average import checked_supersampling
     from ..render.renderer import checked_channels, checked_lod, checked_size
     # Every option is checked before the work.
-    steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
+    seen_from = direction or eye or target or (fov, ortho) != (None, None)
+    moving = motion(out, turntable, path, frames, fps, camera, ignore_distortion, bool(seen_from))
+    steps, picture_size = Steps(quiet), checked_size(parsed_size(size) if size else moving.size)
     wanted = checked_channels(filter(None, channels.split(",")))
     strokes, colored = line_picture(lines, on_white), channel_picture(channel, legend, limit, lines, out)
-    checked_out(out, endings(strokes))
+    if not moving.moves:
+        checked_out(out, endings(strokes))
     if out.suffix.lower() not in (".exr", ".svg") and "color" not in wanted:
         raise InputError(f"channels: expected color among them for a {out.suffix} picture, got {channels}: add it, or "
                          "write .exr")
@@ -100,23 +116,32 @@ def render(source: SourceArgument,
         wanted = strokes.channels(wanted, coarse is thing)
     else:
         thing = loaded_surface(source, how, chosen, steps)
-    camera = view.camera(thing, picture_size)
-    chosen.profile = Profile() if profile else None
-    with steps.step("draw"):
+
+    def drawn(seen):
         if colored:
-            frame = colored.draw(thing, camera, picture_size, lit.shading, lod, supersampling, drawing, chosen)
-        else:
-            frame = clsurf.render(lit.scene(thing, camera), camera, picture_size, wanted, lit.shading, lod,
-                                  device=chosen, supersampling=supersampling, patches=drawing)
+            return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
+        frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
+                              device=chosen, supersampling=supersampling, patches=drawing)
+        if not strokes or not moving.moves:
+            return frame
+        return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
+
+    chosen.profile = Profile() if profile else None
+    if moving.moves:
+        moving.write(out, drawn, thing, view, picture_size, steps)
+    else:
+        seen = moving.camera or view.camera(thing, picture_size)
+        with steps.step("draw"):
+            frame = drawn(seen)
     if profile:
         print(chosen.profile)
         chosen.profile = None
-    if strokes:
-        strokes.save(out, frame, None if coarse is thing else coarse, camera, picture_size, chosen, steps)
-    else:
+    if strokes and not moving.moves:
+        strokes.save(out, frame, None if coarse is thing else coarse, seen, picture_size, chosen, steps)
+    elif not moving.moves:
         with steps.step("write"):
             frame.save(out)
-    steps.say(f"picture: {out.resolve()}")
+    steps.say(f"{'video' if moving.moves else 'picture'}: {out.resolve()}")
 
 
 def report(source: SourceArgument,

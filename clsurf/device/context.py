@@ -1,6 +1,7 @@
 """Choosing and opening devices."""
 
 import errno
+import functools
 import logging
 import os
 import threading
@@ -13,7 +14,7 @@ icd.prepare()  # before pyopencl asks the loader for platforms; makes no context
 import pyopencl as cl  # noqa: E402
 
 from ..errors import DeviceError, DeviceMemoryError  # noqa: E402
-from . import pocl_target  # noqa: E402
+from . import pocl_fork, pocl_target  # noqa: E402
 from .arrays import KEPT_BYTES, DeviceArray, HostPool, give_back, is_aligned, new_array  # noqa: E402
 from .program import Kernel, Profile, build_program, make_kernel  # noqa: E402
 
@@ -24,7 +25,19 @@ _TOO_LARGE = (cl.status_code.INVALID_BUFFER_SIZE, cl.status_code.MEM_OBJECT_ALLO
               cl.status_code.OUT_OF_RESOURCES, cl.status_code.OUT_OF_HOST_MEMORY)
 # Fastest first: a dragon frame took 9.4 ms on Intel's runtime and 10.3 on PoCL 3.0, its build 0.21 and 0.25 s.
 CPU_ORDER = ("intel", "pocl", "portable", "llvmpipe", "oclgrind")
+TRANSLATED = ("rusticl", "Oclgrind")  # platforms that take clang's output on, in which some builtins have no name
 WORDS = {"pocl": ("portable", "pocl"), "intel": ("intel",), "nvidia": ("nvidia",), "amd": ("amd", "advanced micro")}
+
+
+def _told(method):
+    """Make a driver's errors in a method of `Device` clsurf's own."""
+    @functools.wraps(method)
+    def call(self, *arguments, **options):
+        try:
+            return method(self, *arguments, **options)
+        except cl.Error as error:
+            raise self.failure(error) from None
+    return call
 
 
 class Device:
@@ -45,7 +58,7 @@ class Device:
     """
 
     def __init__(self, cl_device, context=None, queue=None):
-        self.cl_device = cl_device
+        self.cl_device, self.process = cl_device, os.getpid()
         self.name = cl_device.name.strip()
         self.platform_name = cl_device.platform.name.strip()
         self.driver, self.version = cl_device.driver_version.strip(), cl_device.version.strip()
@@ -55,6 +68,7 @@ class Device:
         self.local_bytes = cl_device.local_mem_size
         self.lanes = 16 if self.kind == "cpu" else 1
         self.profile: Profile | None = None
+        self.own_constants = {"TRANSLATED": 1} if self.platform_name in TRANSLATED else {}
         if "Portable" in self.platform_name:
             pocl_target.name_processor(cl_device)
         try:
@@ -97,6 +111,18 @@ class Device:
                 kernel = mine[key, name] = make_kernel(self, *self._programs[key], name)
         return kernel
 
+    def failure(self, error: cl.Error) -> DeviceError:
+        """Return what a driver's error means; a device that is lost is opened anew by the next `open_device`."""
+        self.in_flight = []
+        if error.code in _TOO_LARGE:
+            return DeviceMemoryError(f"device {self.name}: it ran out of memory or other resources ({error}): use a "
+                                     "smaller scan or picture, or another device (clsurf devices)")
+        with _opened_lock:
+            for key in [key for key, kept in _opened.items() if kept is self]:
+                del _opened[key]
+        return DeviceError(f"device {self.name}: its driver failed ({error}): try again, or another device (clsurf "
+                           "devices)")
+
     # Memory -------------------------------------------------------------------------------------------------------
 
     def check_memory(self, **nbytes: int) -> None:
@@ -129,11 +155,13 @@ class Device:
         self.fill(array, 0)
         return array
 
+    @_told
     def fill(self, array: DeviceArray, value) -> None:
         """Fill `array` with one value of its dtype."""
         if array.nbytes:
             cl.enqueue_fill_buffer(self.queue, array.buffer, array.dtype.type(value), 0, array.nbytes)
 
+    @_told
     def upload(self, array, dtype=None) -> DeviceArray:
         """Return `array` on the device; CPU devices use aligned, contiguous input in place, so do not change it."""
         array = np.ascontiguousarray(array, dtype)
@@ -150,6 +178,7 @@ class Device:
         self.write(out, array)
         return out
 
+    @_told
     def write(self, target: DeviceArray, array) -> None:
         """Copy host data into a device array of the same size."""
         array = np.ascontiguousarray(array, target.dtype)
@@ -158,6 +187,7 @@ class Device:
         if array.nbytes:
             cl.enqueue_copy(self.queue, target.buffer, array, is_blocking=True)
 
+    @_told
     def download(self, array: DeviceArray, copy: bool = True) -> np.ndarray:
         """Wait for the device and return the content.
 
@@ -178,6 +208,7 @@ class Device:
         del done  # the queue is in order: every launch before the mapping has ended
         return array.host.copy() if copy else array.host
 
+    @_told
     def download_all(self, arrays: dict[str, DeviceArray]) -> dict[str, np.ndarray]:
         """Wait for the device once and return the contents by name; see `download` with `copy=False`.
 
@@ -207,6 +238,7 @@ class Device:
             self.pool.trim()
         give_back()
 
+    @_told
     def finish(self) -> None:
         """Wait until every launch has ended."""
         done, self.in_flight = self.in_flight, []
@@ -233,7 +265,7 @@ def all_devices() -> list:
     devices = []
     for platform in platforms:
         try:
-            devices += platform.get_devices()
+            devices += pocl_fork.usable(platform).get_devices()
         except cl.Error as error:
             log.debug("%s: %s", platform.name, error)
     return sorted(devices, key=_rank)
@@ -281,6 +313,14 @@ def choose_device(selector: str):
     return found[index]
 
 
+def _here(cl_device):
+    """Return a device as this process may use it: see `pocl_fork`."""
+    platform = pocl_fork.usable(cl_device.platform)
+    if platform == cl_device.platform:
+        return cl_device
+    return next((d for d in platform.get_devices() if d.name == cl_device.name), cl_device)
+
+
 _opened: dict = {}
 _opened_lock = threading.Lock()
 
@@ -299,7 +339,9 @@ def open_device(device=None) -> Device:
         No such device, or its driver fails.
     """
     if isinstance(device, Device):
-        return device
+        if device.process == os.getpid():
+            return device
+        device = _here(device.cl_device)  # opened before this process was forked
     if device is None:
         device = os.environ.get("CLSURF_DEVICE", "")
     context = queue = None
@@ -309,7 +351,9 @@ def open_device(device=None) -> Device:
         context, device = device, device.devices[0]
     elif isinstance(device, str):
         device = choose_device(device)
-    elif not isinstance(device, cl.Device):
+    elif isinstance(device, cl.Device):
+        device = _here(device)
+    else:
         raise DeviceError(f"device: expected a name, a clsurf.Device, or a pyopencl Device, Context or CommandQueue, "
                           f"got {type(device).__name__}")
     # A forked child must not use its parent's context: the process number is part of the key.

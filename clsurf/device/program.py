@@ -1,5 +1,6 @@
 """Programs and kernels: built once per context and text, launched with a label, profiled on request."""
 
+import functools
 import hashlib
 import os
 import time
@@ -12,6 +13,7 @@ import pyopencl as cl
 
 from ..errors import KernelBuildError
 from .arrays import DeviceArray
+from .icd import cache_folder, can_be_made
 from .sources import argument_dtypes, kernel_text
 
 # -w: PoCL prints its compiler's warnings straight to the terminal.
@@ -40,6 +42,12 @@ class Kernel:
         local_size = local_size or (1,) * len(global_size)
         global_size = tuple(-(-g // s) * s for g, s in zip(global_size, local_size, strict=True))
         self.kernel.set_args(*(a.buffer if isinstance(a, DeviceArray) else a for a in arguments))
+        try:
+            self._launch(global_size, local_size, arguments)
+        except cl.Error as error:
+            raise self.device.failure(error) from None
+
+    def _launch(self, global_size, local_size, arguments) -> None:
         profile = self.device.profile
         if profile is None:
             cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, global_size, local_size)
@@ -79,9 +87,16 @@ class Profile:
         return "\n".join(lines)
 
 
+@functools.cache
+def program_cache() -> str | None:
+    """Return the folder of pyopencl's cache of programs where its own, None, cannot be made: it would fail then."""
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/tmp") / ".cache")
+    return None if can_be_made(base / "pyopencl") else str(cache_folder() / "pyopencl")
+
+
 def build_program(device, path: str, constants: dict | None):
     """Compile the kernel file `path` for `device`; return (program, text)."""
-    text = kernel_text(path, constants)
+    text = kernel_text(path, device.own_constants | (constants or {}))
     dump = os.environ.get("CLSURF_DUMP")
     if dump:
         key = hashlib.sha256(text.encode()).hexdigest()[:8]
@@ -92,7 +107,7 @@ def build_program(device, path: str, constants: dict | None):
         with warnings.catch_warnings():
             # Drivers chat on success; the text matters only where the build fails.
             warnings.filterwarnings("ignore", category=cl.CompilerWarning)
-            program.build(options=BUILD_OPTIONS)
+            program.build(options=BUILD_OPTIONS, cache_dir=program_cache())
     except cl.RuntimeError as error:
         raise KernelBuildError(f"kernel {path}: {device.name} does not compile it:\n{error}") from None
     return program, text

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import laspy
 import lazrs
+import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -179,7 +180,10 @@ def write_las(scan, path: Path) -> None:
     if "classification" in scan.attributes:
         las.classification = _to_integers(scan.attributes["classification"], 255)
     with open(path, "wb") as file:
-        las.write(file, do_compress=path.suffix.lower() == ".laz")
+        try:
+            las.write(file, do_compress=path.suffix.lower() == ".laz")
+        except lazrs.LazrsError as error:  # a full disk, in the words of the compressor
+            raise OSError(None, str(error)) from None
 
 
 def _to_integers(values, largest: int) -> NDArray:

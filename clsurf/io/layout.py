@@ -16,9 +16,12 @@ from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 from clsurf.surface.patch import PatchSurface
 from clsurf.surface.ranges import RangeImage, RangeScan
+from clsurf.surface.scale_map import ScaleMap
 from clsurf.surface.slim import SlimSurface
+from clsurf.surface.surfel import SurfelHierarchy
 
-KINDS = {"slim": SlimSurface, "patches": PatchSurface, "mesh": Mesh, "points": PointCloud, "ranges": RangeScan}
+KINDS = {"slim": SlimSurface, "patches": PatchSurface, "surfels": SurfelHierarchy, "scale_map": ScaleMap, "mesh": Mesh,
+         "points": PointCloud, "ranges": RangeScan}
 
 
 def to_arrays(thing) -> tuple[str, dict[str, NDArray], dict[str, Any]]:
@@ -50,7 +53,8 @@ def to_arrays(thing) -> tuple[str, dict[str, NDArray], dict[str, Any]]:
             # JSON has no NaN and no infinity; None is NaN on the way back.
             scalars[field.name] = float(value) if math.isfinite(value) else None
         elif value is not None:
-            scalars[field.name] = bool(value) if isinstance(value, bool | np.bool_) else int(value)
+            scalars[field.name] = value if isinstance(value, str) else \
+                bool(value) if isinstance(value, bool | np.bool_) else int(value)
     if kind in _PACKING:
         arrays = _PACKING[kind][0](arrays)
     return kind, arrays, scalars

@@ -7,13 +7,14 @@ as kernels/render/shade.clh lights a pixel. Twin of that lighting: tests/referen
 import numpy as np
 from numpy.typing import NDArray
 
+from ..build.large_faces import longest2
 from ..device import Device, DeviceArray
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
 from ..trace.hits import Hits, trace
 from .shade import Shading
 
 CHANNELS = ("position", "normal", "id")  # that a picture needs for it
-# Where a ray starts, in node spacings of patches or median radii of surfels: up the normal, and along itself.
+# Where a ray starts, in node spacings of patches, texels or median radii of surfels: up the normal, and along itself.
 LIFT, START = 0.05, 0.5
 
 
@@ -31,8 +32,14 @@ def mirror_shares(shading: Shading, count: int) -> NDArray:
 def grain(surface, matrix) -> float:
     """Return the length (world units) within which a surface's own points are no obstacles to rays from it."""
     scale = 1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if hasattr(surface, "radii"):
+    if hasattr(surface, "leaf"):
         own = surface.radii[surface.leaf] if surface.leaf.any() else surface.radii
+    elif hasattr(surface, "spacing"):
+        own = np.array([surface.spacing])
+    elif hasattr(surface, "faces"):
+        own = np.sqrt(longest2(surface.vertices, surface.faces[::max(1, len(surface.faces) // 20_000)]))
+    elif hasattr(surface, "scales"):
+        return scale * surface.radius * 2 / surface.size
     else:
         own = np.linalg.norm(surface.axis_x, axis=1)
     return scale * float(np.median(own)) if len(own) else 0.0
@@ -105,7 +112,11 @@ def base_colors(scene, shading: Shading, surface: NDArray, primitive: NDArray) -
         here = surface == number
         if not shading.model_colors or not here.any():
             continue
-        if own.colors is not None and hasattr(own, "radii"):
+        if getattr(own, "vertex_colors", None) is not None:
+            out[here] = LINEAR_OF_BYTE[own.vertex_colors[own.triangles[primitive[here]], :3]].mean(axis=1)
+        elif own.colors is not None and hasattr(own, "faces"):
+            out[here] = LINEAR_OF_BYTE[own.colors[own.faces[primitive[here]], :3]].mean(axis=1)
+        elif own.colors is not None and hasattr(own, "radii"):
             out[here] = LINEAR_OF_BYTE[own.colors[primitive[here], :3]]
         elif own.colors is not None:
             linear = LINEAR_OF_BYTE[own.colors[:, :3]]

@@ -197,7 +197,7 @@ def draw_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUplo
                  number: int) -> None:
     """Draw one placed surface into the planes of a grid."""
     if upload.count:
-        floats = place_patches(upload, matrix, camera, grid.size, look.shading)
+        floats = grid.clip_into(place_patches(upload, matrix, camera, grid.size, look.shading))
         _stages(device, scratch, grid, upload, floats, device.upload(floats), look, look.lamps, number)
 
 
@@ -207,7 +207,7 @@ def shade_patches(device: Device, scratch: Scratch, grid: Grid, upload: PatchUpl
 
     `whole` is the view buffer of the frame, `lamps` the shading buffer.
     """
-    floats = place_patches(upload, matrix, camera, grid.size, look.shading)
+    floats = grid.clip_into(place_patches(upload, matrix, camera, grid.size, look.shading))
     view = device.upload(np.concatenate([floats, whole, lamps]))
     out = new_channels(device, grid.size, channels)
     lamps = device.upload(lamps) if grid.layout.lit else None

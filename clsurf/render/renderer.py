@@ -1,34 +1,49 @@
 """The renderer: a list of stages from a scene to a frame."""
 
+import os
 import threading
 import weakref
 
 import numpy as np
 
 from ..device import Device, Profile, open_device
-from ..errors import DeviceError, InputError
+from ..errors import DeviceError, DeviceMemoryError, InputError
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .average import average, checked_supersampling, fine_channels
+from .bands import draw_in_bands
 from .camera import Camera
+from .clip import checked_clip, view_clip
 from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
 from .frame import Frame
+from .mesh import draw_mesh, upload_mesh
 from .mirror import CHANNELS as MIRROR_CHANNELS
 from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
+from .resident import checked_budget, resident_scene
+from .scale_map import draw_scale_map, upload_scale_map
+from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
+from .surfels import draw_surfels, upload_surfels
 from .tiles import BIN, Grid, Layout, Scratch, view_floats
 from .traced_light import light_grid, wants_traced_light
 
 # How each kind of surface is put on the device, and drawn into a grid.
-KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches)}
+KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
+         SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
+         Mesh: (upload_mesh, draw_mesh)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM = Shading(), PatchDrawing(), SlimDrawing()
+DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP = (
+    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing())
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -45,14 +60,22 @@ class Renderer:
         Pixels across a tile, a multiple of 8; by default 32 (8 for work-groups).
     profile : bool
         Time every launch; see the attribute `profile`.
+    budget : int or str
+        Bytes that each `StoredSurface` may take in memory, such as "2GB".
+    wait : bool
+        Draw a `StoredSurface` when all that the view needs of it has been read. Otherwise a frame shows what is there,
+        and `complete` says whether that is all; later frames show more.
 
     Attributes
     ----------
+    complete : bool
+        Whether the last frame shows all that it should of the stored surfaces in it, within the budget.
     profile : Profile or None
         Print it for a table of kernels and times.
     """
 
-    def __init__(self, device=None, lanes: int | None = None, tile: int | None = None, profile: bool = False):
+    def __init__(self, device=None, lanes: int | None = None, tile: int | None = None, profile: bool = False,
+                 budget: int | str = "2GB", wait: bool = False):
         self.device: Device = open_device(device)
         lanes = self.device.lanes if lanes is None else lanes
         if lanes not in (16, 8, 4, 1):
@@ -65,11 +88,14 @@ class Renderer:
         self.profile = Profile() if profile else None
         self._scratch: Scratch | None = Scratch(self.device, lanes)
         self._uploads = weakref.WeakKeyDictionary()
+        self._residents = weakref.WeakKeyDictionary()
+        self.budget, self.wait, self.complete = checked_budget(budget), wait, True
 
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
                background=(1.0, 1.0, 1.0, 1.0), supersampling: int = 1, patches: PatchDrawing | None = None,
-               slim: SlimDrawing | None = None) -> Frame:
+               slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+               scale_map: ScaleMapDrawing | None = None, clip=None) -> Frame:
         """Draw a scene.
 
         Parameters
@@ -82,7 +108,8 @@ class Renderer:
         channels : sequence of str
             Of "color", "depth", "normal", "position", "id", "count", "level", "cost" (see `Frame`); "cost" is the
             number of surfel evaluations per pixel of the pixel's bin of 8x8, or that of tests of a pixel against a
-            cell of a patch. For patches "count" is 1 and "level" the mip level, 0 for the patch's own nodes.
+            cell of a patch or a scale map. For patches "count" is 1 and "level" the mip level, 0 for the patch's own
+            nodes; for scale maps 1 and the layer.
             Curvature of SLIM surfaces (float32, NaN elsewhere), from blended derivatives of the surfels (paper,
             equation 8, left), world units: "mean", "gaussian", "k1" >= "k2" (1/length; positive where the surface
             curves away from the side its stored normals point to, that of the eye where it is not oriented),
@@ -103,6 +130,13 @@ class Renderer:
             How spatial patches are drawn.
         slim : SlimDrawing, optional
             How SLIM surfaces are drawn.
+        surfels : SurfelDrawing, optional
+            How surfel hierarchies are drawn.
+        scale_map : ScaleMapDrawing, optional
+            How scale maps are drawn.
+        clip : (4,) or (n, 4) array_like, optional
+            Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
+            that the inside is seen. What is cut off still throws shadows and is seen in mirrors.
 
         Returns
         -------
@@ -113,12 +147,14 @@ class Renderer:
         InputError
             An option that cannot be used.
         DeviceError
-            The renderer is closed, or the device lacks memory.
+            The renderer is closed, or the device lacks memory even for a band of the picture.
         """
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
+        if self.device.process != os.getpid():
+            raise DeviceError("renderer: it was made before this process was forked: make a new Renderer")
         scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
-        factor = checked_supersampling(supersampling)
+        factor, clip = checked_supersampling(supersampling), checked_clip(clip)
         picture, size = size, checked_size([n * factor for n in size])
         asked, channels = channels, fine_channels(channels, factor)
         curved = wanted_differentials(channels)
@@ -134,17 +170,26 @@ class Renderer:
         slim = DEFAULT_SLIM if slim is None else slim
         if not isinstance(slim, SlimDrawing):
             raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
+        surfels = DEFAULT_SURFELS if surfels is None else surfels
+        if not isinstance(surfels, SurfelDrawing):
+            raise InputError(f"surfels: expected a clsurf.SurfelDrawing, got {surfels!r}")
+        scale_map = DEFAULT_SCALE_MAP if scale_map is None else scale_map
+        if not isinstance(scale_map, ScaleMapDrawing):
+            raise InputError(f"scale_map: expected a clsurf.ScaleMapDrawing, got {scale_map!r}")
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
+        scene, self.complete = resident_scene(scene, self._residents, camera, size, lod, self.budget, self.wait)
         check_differentials(scene.placed, curved, shading.look, slim)
-        own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
-        try:
+
+        def draw(scene, camera, picture):
+            size = tuple(n * factor for n in picture)
+            traced = wants_traced_light(shading, channels)
             # The stages of a frame.
             placed, origin = scene.placed, scene_origin(scene)
-            traced = wants_traced_light(shading, channels)
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not traced
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, planes=not at_once)
+            grid = self._new_grid(placed, size, channels, curved, shading, patches, view_clip(clip, camera),
+                                  planes=not at_once)
             floats = shading_floats(shading, scene.lights, background, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
             if at_once:
@@ -155,7 +200,9 @@ class Renderer:
                 lamps = self.device.upload(floats)
                 for number, (surface, matrix) in enumerate(placed):
                     KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                            Look(shading, lod, patches, slim, lamps, "cost" in channels), number)
+                                            Look(shading, lod, patches, slim, surfels, scale_map, lamps,
+                                                 "cost" in channels),
+                                            number)
                 if traced:
                     light_grid(self.device, self._scratch, grid, scene, camera, shading, floats, lamps)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
@@ -167,6 +214,18 @@ class Renderer:
             arrays = self.device.download_all(arrays)
             arrays |= split_differentials(arrays.pop(NAME), curved) if curved else {}
             return Frame({name: arrays[name] for name in asked}, origin, camera)
+
+        cull = not wants_traced_light(shading, channels) and not wants_mirror(shading, channels)
+        own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
+        try:
+            try:
+                return draw(scene, camera, picture)
+            except DeviceMemoryError as error:
+                failed = error
+            if not scene.surfaces:
+                raise failed
+            self._give_back()
+            return draw_in_bands(draw, scene, camera, picture, cull)
         finally:
             self.device.profile = own_profile
 
@@ -174,10 +233,10 @@ class Renderer:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         return Camera.framing(thing, aspect=size[0] / size[1])
 
-    def _new_grid(self, placed, size, channels, curved, shading, patches, planes: bool) -> Grid:
+    def _new_grid(self, placed, size, channels, curved, shading, patches, clip, planes: bool) -> Grid:
         """Return bins that nothing has touched yet; without `planes` only their places."""
-        colored = shading.model_colors and any(s.colors is not None or getattr(s, "color", None) is not None
-                                               for s, _ in placed)
+        colored = shading.model_colors and any(getattr(s, name, None) is not None
+                                               for s, _ in placed for name in ("colors", "color"))
         colored |= shading.look.startswith("ball")
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
@@ -185,7 +244,7 @@ class Renderer:
         traced = wants_traced_light(shading, channels)
         layout = Layout(color=(colored or lit or traced) and "color" in channels, id="id" in channels,
                         count="count" in channels, level="level" in channels, lit=lit, traced=traced,
-                        differentials=curved)
+                        clip_planes=len(clip), differentials=curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * planes,
@@ -193,11 +252,11 @@ class Renderer:
                                  **{name: 4 * max(CHANNELS[name][0], 1) * pixels for name in channels})
         patch_bins = self.tile_bins if self._tile_given else tile_bins_of_patches(size, self._scratch.lanes)
         if not planes:
-            return Grid(size, self.tile_bins, layout, None, None, patch_bins)
+            return Grid(size, self.tile_bins, layout, None, None, patch_bins, clip)
         touched = self._scratch.array("touched", (bins,), np.int32)
         self.device.fill(touched, -1)
         return Grid(size, self.tile_bins, layout, touched,
-                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins)
+                    self._scratch.array("planes", (bins, fields, 64), np.float32), patch_bins, clip)
 
     def _uploaded(self, surface):
         upload = self._uploads.get(surface)
@@ -205,12 +264,19 @@ class Renderer:
             upload = self._uploads[surface] = KINDS[type(surface)][0](self.device, surface)
         return upload
 
+    def _give_back(self) -> None:
+        """Give back what is kept between frames."""
+        self._scratch.clear()
+        self._uploads.clear()
+        self.device.trim()
+
     def close(self) -> None:
         """Give all device memory back; the renderer cannot be used afterwards. May be called twice."""
         if self._scratch is not None:
             self._scratch.clear()
             self._scratch = None
             self._uploads.clear()
+            self._residents.clear()
 
     def __repr__(self):
         state = "closed" if self._scratch is None else f"tiles of {BIN * self.tile_bins} pixels"
@@ -263,13 +329,14 @@ def checked_lod(lod) -> float:
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
            channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
            background=(1.0, 1.0, 1.0, 1.0), device=None, tile: int | None = None, supersampling: int = 1,
-           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None) -> Frame:
+           patches: PatchDrawing | None = None, slim: SlimDrawing | None = None, surfels: SurfelDrawing | None = None,
+           scale_map: ScaleMapDrawing | None = None, clip=None) -> Frame:
     """Draw a scene once; see `Renderer.render`. For many frames keep a `Renderer`.
 
     Uploads are kept while their surface lives.
     """
     return shared_renderer(device, tile).render(scene, camera, size, channels, shading, lod, background,
-                                                supersampling, patches, slim)
+                                                supersampling, patches, slim, surfels, scale_map, clip)
 
 
 _shared = threading.local()
@@ -281,5 +348,5 @@ def shared_renderer(device=None, tile: int | None = None) -> Renderer:
     kept = _shared.__dict__.setdefault("renderers", {})
     key = (id(opened), tile)
     if key not in kept:
-        kept[key] = Renderer(opened, tile=tile)
+        kept[key] = Renderer(opened, tile=tile, wait=True)
     return kept[key]

@@ -6,12 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..io.stored import StoredSurface
+from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
+from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
+from ..surface.surfel import SurfelHierarchy
 from .shade import Light
 
-DRAWABLE = (SlimSurface, PatchSurface)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, StoredSurface)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,7 +48,7 @@ class Scene:
             if not isinstance(own, DRAWABLE):
                 raise InputError(f"scene: surface {i} is a {type(own).__name__}, expected one of "
                                  f"{', '.join(kind.__name__ for kind in DRAWABLE)}, plain or placed: build a surface "
-                                 "from a scan first (clsurf.build_slim, clsurf.build_patches)")
+                                 "from a scan first (clsurf.build_slim, clsurf.build_patches, clsurf.build_scale_map)")
 
     def __repr__(self):
         return f"Scene({len(self.surfaces)} surfaces, {len(self.lights)} lights)"

@@ -1,6 +1,6 @@
 """Shading: material, lights, background, and the last stage, which writes the channels of the picture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -9,7 +9,9 @@ from ..errors import InputError
 from ..surface.srgb import to_linear
 from .differentials import NAME
 from .patch_drawing import PatchDrawing
+from .scale_map_drawing import ScaleMapDrawing
 from .slim_drawing import SlimDrawing
+from .surfel_drawing import SurfelDrawing
 from .tiles import BIN, Grid, Scratch
 
 CHANNELS = {"color": (4, np.float32), "depth": (0, np.float32), "normal": (3, np.float32), "position": (3, np.float32),
@@ -133,6 +135,8 @@ class Look:
     lod: float
     patches: PatchDrawing
     slim: SlimDrawing
+    surfels: SurfelDrawing = field(default_factory=SurfelDrawing)
+    scale_map: ScaleMapDrawing = field(default_factory=ScaleMapDrawing)
     lamps: DeviceArray | None = None  # the shading buffer, for what is lit before the last stage
     cost: bool = False  # whether the frame wants the costs of bins
 

@@ -243,7 +243,7 @@ def draw_slim(device: Device, scratch: Scratch, grid: Grid, upload: SlimUpload, 
     balls = shading.look.startswith("ball")
     one_level = balls and shading.level is not None
     floats, visited_end = place_slim(upload, matrix, camera, grid.size, 0.0 if one_level else lod)
-    view = device.upload(floats)
+    view = device.upload(grid.clip_into(floats))
     visited = select_slim(device, scratch, upload, view, visited_end)
     flags, visited_end = (level_flags(device, upload, shading.level), 0) if one_level else (upload.flags, visited_end)
     records, footprints = project_slim(device, scratch, upload, view, flags, visited, visited_end, balls)

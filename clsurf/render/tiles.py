@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
+from .clip import CLIP
 from .differentials import field_constants, plane_counts
 
 BIN = 8  # pixels; kernels/common/bins.clh
-VIEW_FLOATS = 32  # kernels/common/view.clh
+VIEW_FLOATS = 64  # kernels/common/view.clh
 DEPTH_BUCKETS = 2048  # kernels/common/bins.clh
 
 
@@ -28,6 +29,7 @@ class Layout:
     level: bool = False
     lit: bool = False  # colours of patches are lit at their nodes
     traced: bool = False  # colours are lit before the last stage, where rays decide over the light
+    clip_planes: int = 0
     differentials: tuple[str, ...] = ()  # channels of curvature, in the order of their planes
 
     @property
@@ -46,7 +48,7 @@ class Layout:
         if self.differentials:
             out |= field_constants(self.differentials, at)
             at += self.differential_planes
-        return out | {"FIELDS": at, "LIT_COLORS": self.lit or self.traced}
+        return out | {"FIELDS": at, "LIT_COLORS": self.lit or self.traced, "CLIP_PLANES": self.clip_planes}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,13 @@ class Grid:
     touched: DeviceArray | None  # (bins,) int32: pixel evaluations of the tile stages, -1 where nothing came
     planes: DeviceArray | None  # (bins, FIELDS, 64) float32; None where the picture is shaded without them
     patch_bins: int = 4  # bins across a tile of patches
+    clip: NDArray | None = None  # (n, 4) float64: clip planes, view space
+
+    def clip_into(self, view: NDArray) -> NDArray:
+        """Write the clip planes into a view buffer (VIEW_FLOATS,) float32 and return it."""
+        if self.clip is not None and len(self.clip):
+            view[CLIP:CLIP + self.clip.size] = self.clip.ravel()
+        return view
 
     @property
     def bins_x(self) -> int:
@@ -96,7 +105,7 @@ class PairLists:
 
 
 def view_floats(camera, size, rotation=None, offset=None, scale=1.0, lod=0.0, depths=(0.0, 1.0)) -> NDArray:
-    """Return the view buffer (32,) float32 of kernels/common/view.clh.
+    """Return the view buffer (64,) float32 of kernels/common/view.clh.
 
     Parameters
     ----------

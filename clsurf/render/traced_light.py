@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
-from ..surface.patch import PatchSurface
 from ..surface.slim import SlimSurface
 from ..trace.hits import trace
 from ..trace.packets import packet_lanes, trace_lights
@@ -21,7 +20,7 @@ from .tiles import BIN, Grid, Scratch, view_floats
 
 LAMP_FLOATS = 8
 LARGEST_LAMPS = 32  # bits of a word
-PATCH_STEPS = 1.5  # node spacings that shadow rays start above patches: rays see two flat triangles in each cell
+LIFT_STEPS = 1.5  # spacings that shadow rays start above surfaces: rays see two flat triangles in each cell of a patch
 REACH = 0.25  # of the scene's diagonal: what ambient occlusion looks for by default
 
 
@@ -45,7 +44,7 @@ def light_grid(device: Device, scratch: Scratch, grid: Grid, scene, camera, shad
         shadows = scratch.array("shadows", (bins, 64), np.uint32)
         own = device.upload(floats[16:].reshape(-1, LAMP_FLOATS)) if len(scene.lights) else lamps
         cast(device, scratch, grid, casters, views, own, len(scene.lights), np.inf, shadows, 1, 0)
-        cast_patches(device, grid, scene, camera, shadows)
+        cast_rays(device, grid, scene, camera, shadows)
     if shading.occlusion:
         lights = sphere_lamps(shading.occlusion, camera)
         count = len(lights)
@@ -76,9 +75,9 @@ def cast(device: Device, scratch: Scratch, grid: Grid, casters, views, lamps: De
                      i == 0, grid.bins_x, grid.bins_y, grid.touched, grid.planes, mask, 64 * words, 64 * word)
 
 
-def cast_patches(device: Device, grid: Grid, scene, camera, mask: DeviceArray) -> None:
-    """Add to the mask (bins, 64) the lamps that spatial patches hide: single rays from the points to the lamps."""
-    parts = [part for part in scene.surfaces if isinstance(getattr(part, "surface", part), PatchSurface)]
+def cast_rays(device: Device, grid: Grid, scene, camera, mask: DeviceArray) -> None:
+    """Add to the mask (bins, 64) the lamps that surfaces other than SLIM hide: single rays from points to lamps."""
+    parts = [part for part in scene.surfaces if not isinstance(getattr(part, "surface", part), SlimSurface)]
     if not parts:
         return
     bins = np.flatnonzero(device.download(grid.touched) >= 0)
@@ -91,7 +90,7 @@ def cast_patches(device: Device, grid: Grid, scene, camera, mask: DeviceArray) -
     points = np.stack([(x - p.cx) / p.fx * across, (p.cy - y) / p.fy * across, -depth], axis=1)
     points = points @ camera.rotation + camera.eye
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-300) @ camera.rotation
-    step = PATCH_STEPS * max(grain(*part) for part in scene.placed if isinstance(part[0], PatchSurface))
+    step = LIFT_STEPS * max(grain(*part) for part in scene.placed if not isinstance(part[0], SlimSurface))
     found = device.download(mask)
     for bit, light in enumerate(scene.lights):
         if light.kind == "headlight":

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import bounds_of, frozen, recentred
+from .placed import Placed, placed
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,6 +67,10 @@ class PointCloud:
         """Bytes of all arrays."""
         arrays = (self.points, self.normals, self.colors, self.scanners, *self.attributes.values())
         return sum(a.nbytes for a in arrays if a is not None)
+
+    def moved(self, matrix) -> Placed:
+        """Return this cloud placed by the similarity `matrix` (4, 4), the arrays shared."""
+        return placed(self, matrix)
 
     def __repr__(self):
         low, high = self.bounds

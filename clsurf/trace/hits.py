@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
-from . import ray_slim, ray_triangles  # noqa: F401  they register their kinds
+from . import ray_scale_map, ray_slim, ray_surfels, ray_triangles  # noqa: F401  they register their kinds
 from .kinds import ANY, CLOSEST, NEXT, traced
 from .single import (
     HIT_FLOATS,
@@ -46,7 +46,7 @@ class Hits:
     surface : (n,) int32
         Number of the surface in the scene or list, 0 for a single surface; -1: missed.
     primitive : (n,) int32
-        What was hit of it: a mesh's face, a SLIM surface's frontmost surfel, a patch; -1: missed.
+        What was hit of it: a mesh's face, a SLIM surface's or hierarchy's frontmost surfel, a patch; -1: missed.
     offsets : (rays + 1,) int64 or None
         Only for "all".
     """
@@ -75,11 +75,12 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
 
     A SLIM surface is hit where the renderer draws it without level of detail: frontmost surfels, blended. A mesh and
     the cells of spatial patches (two triangles each; cells with a transparent node are no obstacle) are hit without
-    leaks along edges and at vertices.
+    leaks along edges and at vertices. Of a surfel hierarchy the finest level is hit: base surfels, blended, or
+    triangles.
 
     Parameters
     ----------
-    thing : SlimSurface, PatchSurface, Mesh, a placed one, a Scene, or a list of those
+    thing : SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, a placed one, a Scene, or a list of those
     origins, directions : (..., 3) array_like
         World space, float64; broadcast against each other. Directions need not be unit; a ray whose direction is zero
         or whose numbers are not finite misses.

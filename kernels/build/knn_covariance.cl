@@ -81,7 +81,8 @@ __kernel void knn_covariance(__global const VF *nodes, __global const float *lea
 {
   uint first = get_global_id(0) * VW;
   if (first >= query_count) return;
-  Queries q = load_queries(queries, first, query_count);
+  Queries q;
+  load_queries(queries, first, query_count, &q);
 
   VF best[16 * CHUNKS];
   for (int i = 0; i < 16 * CHUNKS; i++) best[i] = FAR;

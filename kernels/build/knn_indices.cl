@@ -46,7 +46,8 @@ __kernel void knn_indices(__global const VF *nodes, __global const float *leaves
 {
   uint first = get_global_id(0) * VW;
   if (first >= query_count) return;
-  Queries q = load_queries(queries, first, query_count);
+  Queries q;
+  load_queries(queries, first, query_count, &q);
 
   VF best[16 * CHUNKS];
   VI index[16 * CHUNKS];

@@ -18,7 +18,7 @@ __kernel void range_weights(int rows, int columns, int first, float eye_x, float
       count++;
     }
   if (!count) return;
-  float4 v = (float4)(eye_x, eye_y, eye_z, 0.0f) - samples[k];
+  float4 v = (float4)(eye_x, eye_y, eye_z, 0.0f) - place_at(samples, k);
   float area = sqrt(dot3(total, total)), facing = fabs(dot3(total, v)) / (sqrt(dot3(v, v)) * area);
   float edge = ((float)border[k] + 0.5f) / ramp;
   edge = edge < 1.0f ? edge : 1.0f;

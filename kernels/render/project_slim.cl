@@ -7,6 +7,7 @@
 #include "common/visibility.clh"
 #include "common/select_slim.clh"
 #include "common/bins.clh"
+#include "common/blocks.clh"
 
 #ifndef BALLS
 #define BALLS 0  // 1: bound the balls themselves, at their own size, for tile_balls
@@ -26,19 +27,6 @@ INLINE void extent(VF m2, VF mn, float radius, VF low, VF high, VF *lo, VF *hi) 
   VF a = mn * low, b = mn * high;
   *lo = greater(lesser(a, b) - flat, -ball);
   *hi = lesser(greater(a, b) + flat, ball);
-}
-
-// First and last block of 4 pixels whose pixel centres lie in [lo, hi].
-INLINE void block_range(VF lo, VF hi, float size, VI *first, VI *last) {
-  lo = greater(lo - 0.5f, (VF)(-1.0f)); hi = lesser(hi - 0.5f, (VF)(size));
-  lo = lesser(lo, (VF)(size)); hi = greater(hi, (VF)(-2.0f));
-  VI a = TO_VI(lo + 3.0f) - 2;  // ceil for lo > -2 (truncation of a positive number is floor)
-  VI b = TO_VI(hi + 2.0f) - 2;  // floor
-  a = SEL(a, a - 1, TO_VF(a - 1) >= lo);
-  VI top = (VI)((int)size - 1);
-  a = SEL(a, (VI)(0), a < 0); b = SEL(b, top, b > top);
-  VI none = b < a;
-  *first = SEL(a >> 2, (VI)(1), none); *last = SEL(b >> 2, (VI)(0), none);
 }
 
 __kernel void project_slim(__global const float *view, __global const float *surfels, int stride, int count,
@@ -79,7 +67,7 @@ __kernel void project_slim(__global const float *view, __global const float *sur
   VF inv_r = 1.0f / r;
   // The frame of the stored normal (common/frame.clh in lanes), turned into view space.
   VF nx = plane[NORMAL * step], ny = plane[(NORMAL + 1) * step], nz = plane[(NORMAL + 2) * step];
-  VF sign = SEL((VF)(1.0f), (VF)(-1.0f), AS_VI(nz) < 0);
+  VF sign = SIGN_OF(nz);
   VF a = -1.0f / (sign + nz), b = nx * ny * a;
   VF ax = 1.0f + sign * nx * nx * a, ay = sign * b, az = -sign * nx;
   VF bx = b, by = sign + ny * ny * a, bz = -ny;

@@ -3,6 +3,7 @@
 #include "common/slim.clh"
 #include "common/planes.clh"
 #include "common/view.clh"
+#include "common/clip.clh"
 
 #ifndef TILE_BINS
 #define TILE_BINS 4
@@ -17,6 +18,8 @@ INLINE void draw_balls(__global const float *view, __global const uint2 *pairs, 
   if (was_touched) before = load_plane(planes, FIELD_DEPTH, at);
   VF z = before, red = 0.0f, green = 0.0f, blue = 0.0f;
   VI nearest = 0;
+  VF low = view[NEAR], high = INFINITY;
+  clip_range(view, px, py, &low, &high);
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
     if (!(pair.y >> quarter & 1u) || !any_lane(near_of_key(pair.y) < z)) continue;
@@ -28,11 +31,18 @@ INLINE void draw_balls(__global const float *view, __global const uint2 *pairs, 
     VF disc = b * b - a * c;
     VF root = VSQRT(VMAX(disc, (VF)(0.0f)));
     VF s = (-b - root) / a, t = k[T_REF] + s;
-    VI good = (disc >= 0.0f) & (t > view[NEAR]) & (t < z);
+    VF turn = 1.0f;
+#if CLIP_PLANES
+    VI inner = t <= low;  // the ball is cut open: its far side is seen from within
+    s = SEL(s, (root - b) / a, inner);
+    t = k[T_REF] + s;
+    turn = SEL((VF)(1.0f), (VF)(-1.0f), inner);
+#endif
+    VI good = (disc >= 0.0f) & (t > low) & (t < high) & (t < z);
     z = SEL(z, t, good);
     u += s * du; v += s * dv; w += s * dw;
-    fx = SEL(fx, k[RADIUS_PX] * (u * k[UX] + v * k[VX] + w * k[WX]), good);
-    fy = SEL(fy, k[RADIUS_PX] * (u * k[UY] + v * k[VY] + w * k[WY]), good);
+    fx = SEL(fx, turn * k[RADIUS_PX] * (u * k[UX] + v * k[VX] + w * k[WX]), good);
+    fy = SEL(fy, turn * k[RADIUS_PX] * (u * k[UY] + v * k[VY] + w * k[WY]), good);
     ft = SEL(ft, -root * k[RADIUS], good);
     float4 color = colors[INDEX_OF(pair)];
     red = SEL(red, (VF)(color.x), good); green = SEL(green, (VF)(color.y), good);

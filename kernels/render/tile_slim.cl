@@ -11,6 +11,7 @@
 #include "common/bins.clh"
 #include "common/planes.clh"
 #include "common/view.clh"
+#include "common/clip.clh"
 #include "render/differentials.clh"
 
 #ifndef TILE_BINS
@@ -65,20 +66,18 @@ INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *k
 
 // Records are scattered: asking for all of a bin's at once hides their latency (8.0 -> 6.8 ms of a dragon frame).
 INLINE void fetch_ahead(__global const uint2 *pairs, int count, __global const float *records) {
-#ifdef __clang__
-#if __has_builtin(__builtin_prefetch)
+#ifdef HAS_PREFETCH
   for (int e = 0; e < count; e++) {
     size_t record = (size_t)(records + (size_t)INDEX_OF(pairs[e]) * RECORD_FLOATS);
     __builtin_prefetch((const void *)record);
     __builtin_prefetch((const void *)(record + 64));
   }
 #endif
-#endif
 }
 
 // Take the root of one side where it is a hit nearer than `z`.
 INLINE void frontmost_root(__global const float *k, RayPoly p, uint index, float side, VF u, VF v, VF w, VF du, VF dv,
-                           VF dw, VF low, VF *z, VF *hit, VF *facing, VI *nearest) {
+                           VF dw, VF low, VF high, VF *z, VF *hit, VF *facing, VI *nearest) {
   VF s, slope;
   VI good = ray_root(p, (VF)(side), &s, &slope);
   u += s * du; v += s * dv; w += s * dw;
@@ -86,6 +85,9 @@ INLINE void frontmost_root(__global const float *k, RayPoly p, uint index, float
   VF key = t;
   if (ORIENTED && side < 0.0f) key = t + k[BIAS];
   good = good & (u * u + v * v + w * w < ALPHA * ALPHA) & (t > low) & (key < *z);
+#if CLIP_PLANES
+  good = good & (t < high);
+#endif
   uint lo = as_uint(k[FOOT_LO]), hi = as_uint(k[FOOT_HI]);
   if ((lo & hi) != 0xffffffffu) good = good & inside_footprint(lo, hi, u, v);
   *z = SEL(*z, key, good);
@@ -96,10 +98,10 @@ INLINE void frontmost_root(__global const float *k, RayPoly p, uint index, float
 #endif
 }
 
-// Pass 1: depth of the frontmost hit behind `low` and in front of `z` (in), its side (1, -1) and surfel. Returns whether
+// Pass 1: depth of the frontmost hit behind `low` and in front of `high` and `z` (in), its side (1, -1) and surfel. Returns whether
 // pairs further back may still matter.
 INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global const float *records, VF px, VF py,
-                     VF low, VF *z, VF *hit, VF *facing, VI *nearest, int *cost) {
+                     VF low, VF high, VF *z, VF *hit, VF *facing, VI *nearest, int *cost) {
   int more = 1;
   for (int e = 0; e < count; e += AT_ONCE) {
     float near = near_of_key(pairs[e].y);
@@ -113,8 +115,9 @@ INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global 
       VF u = k[U0] + k[UX] * x + k[UY] * y, v = k[V0] + k[VX] * x + k[VY] * y, w = k[W0] + k[WX] * x + k[WY] * y;
       VF du = k[DU] + k[INV_T] * u, dv = k[DV] + k[INV_T] * v, dw = k[DW] + k[INV_T] * w;
       RayPoly p = ray_poly(k, u, v, w, du, dv, dw);
-      if (pair.x & SEEN_FRONT) frontmost_root(k, p, INDEX_OF(pair), 1.0f, u, v, w, du, dv, dw, low, z, hit, facing, nearest);
-      if (pair.x & SEEN_BACK) frontmost_root(k, p, INDEX_OF(pair), -1.0f, u, v, w, du, dv, dw, low, z, hit, facing, nearest);
+#define ROOT_OF(side) frontmost_root(k, p, INDEX_OF(pair), side, u, v, w, du, dv, dw, low, high, z, hit, facing, nearest)
+      if (pair.x & SEEN_FRONT) ROOT_OF(1.0f);
+      if (pair.x & SEEN_BACK) ROOT_OF(-1.0f);
       *cost += 1;
     }
   }
@@ -204,7 +207,8 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   VF px = TO_VF(lane_x) + (bin_x * BIN + 0.5f), py = TO_VF(lane_y) + (bin_y * BIN + 0.5f);
   VF before = EMPTY_DEPTH;
   if (was_touched) before = load_plane(planes, FIELD_DEPTH, at);
-  VF low = view[NEAR], infinite = INFINITY;
+  VF low = view[NEAR], high = INFINITY, infinite = INFINITY;
+  clip_range(view, px, py, &low, &high);
   VI active = TRUE_LANES, any_hit = 0;
   Blend best;
   best.depth = infinite;
@@ -219,13 +223,14 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
     VF z = SEL(-infinite, before, active), hit = infinite, facing = 0.0f;
     VI nearest = 0;
 #if VW == 1
-    frontmost(pairs, count, 16u << quarter, view[BUCKET_DEPTH], records, px, py, low, &z, &hit, &facing, &nearest, &cost);
+    frontmost(pairs, count, 16u << quarter, view[BUCKET_DEPTH], records, px, py, low, high, &z, &hit, &facing, &nearest,
+              &cost);
 #else
     uint2 kept[SEGMENT];
     int more = 1;
     for (int first = 0; first < count && more; first += SEGMENT) {
       int n = filtered(pairs + first, count - first < SEGMENT ? count - first : SEGMENT, quarter + 4, kept);
-      more = frontmost(kept, n, 0u, view[BUCKET_DEPTH], records, px, py, low, &z, &hit, &facing, &nearest, &cost);
+      more = frontmost(kept, n, 0u, view[BUCKET_DEPTH], records, px, py, low, high, &z, &hit, &facing, &nearest, &cost);
     }
 #endif
     VI found = hit < infinite;

@@ -6,6 +6,7 @@
 //
 // A bottom node has a block of 9 vectors of 16 floats: the corners A, B, C of the triangle in each slot, x, y, z each.
 #include "trace/ray_walk.clh"
+#include "common/edge_side.clh"
 
 enum { A_X, B_X = 3, C_X = 6 };
 #define FIELDS 9
@@ -24,27 +25,6 @@ INLINE Shear shear_of(const Ray *r) {
   s.sz = 1.0f / d[s.z]; s.sx = d[s.x] * s.sz; s.sy = d[s.y] * s.sz;
   s.ox = o[s.x]; s.oy = o[s.y]; s.oz = o[s.z];
   return s;
-}
-
-// 1 or -1: the side of the ray that the edge from p to q passes on; 0 for an edge of no length. The products are
-// compared, not subtracted: rounding keeps their order, so an edge has opposite signs from its two ends.
-INLINE VF edge_side(VF px, VF py, VF qx, VF qy) {
-  VF a = qx * py, b = qy * px;
-  VF zero = 0.0f, one = 1.0f;
-  VF side = SEL(SEL(zero, -one, a < b), one, a > b);
-  VI tie = a == b;
-  if (!any_lane(tie)) return side;
-  // What rounding took from the products, by halves of 12 bits (no fma, which is slow on PoCL), then (e, e^2).
-#define HIGH_HALF(v) (AS_VF(AS_VI(v) & (VI)0xfffff000))
-  VF qxh = HIGH_HALF(qx), qxl = qx - qxh, pyh = HIGH_HALF(py), pyl = py - pyh;
-  VF qyh = HIGH_HALF(qy), qyl = qy - qyh, pxh = HIGH_HALF(px), pxl = px - pxh;
-  VF ra = ((qxh * pyh - a) + qxh * pyl + qxl * pyh) + qxl * pyl;
-  VF rb = ((qyh * pxh - b) + qyh * pxl + qyl * pxh) + qyl * pxl;
-  VF rest = SEL(SEL(zero, -one, ra < rb), one, ra > rb);
-  VF up = SEL(SEL(zero, -one, qy < py), one, qy > py);
-  VF across = SEL(SEL(zero, -one, px < qx), one, px > qx);
-  rest = SEL(rest, SEL(up, across, up == 0.0f), rest == 0.0f);
-  return SEL(side, rest, tie);
 }
 
 typedef struct { float low; int slot; } Goal;  // hits are looked for behind t = low; at it in slots behind `slot`

@@ -1,4 +1,4 @@
-// Distance from 16 queries at a time, one per lane, to the nearest of a mesh's triangles.
+// Distance from 16 queries at a time, one per lane, to the nearest of a mesh's triangles, and its number.
 //
 // Triangles stand behind their balls (centroid and furthest corner) in blocks of 16 under the tree of point_tree.clh.
 // The reach grows until the nearest triangle of every lane lies inside what was searched.
@@ -42,7 +42,7 @@ inline VF triangle_gap2(__global const float *t, Vectors p) {
 __kernel void triangle_distances(int count, int query_stride, __global const float *queries,
                                  __global const float *triangles, int padded, __global const float *balls,
                                  __global const float *boxes, __global const int *node_offset, int top_level,
-                                 float margin, __global float *out) {
+                                 float margin, __global float *out, __global int *nearest) {
   int packet = get_global_id(0);
   if (16 * packet >= count) return;
   size_t stride = query_stride, first = 16 * (size_t)packet;
@@ -55,9 +55,11 @@ __kernel void triangle_distances(int count, int query_stride, __global const flo
   uint list[BLOCK_LIST];
   Traversal t;
   VF best = 1e30f;
+  VI found = 0;
   for (int round = 0; round < 200; ++round) {
     float reach = s.extent + margin;
     best = 1e30f;
+    found = 0;
     traversal_start(&t, top_level);
     int blocks;
     while ((blocks = traversal_next(&t, boxes, node_offset, s.x, s.y, s.z, reach * reach, list)) > 0)
@@ -67,6 +69,7 @@ __kernel void triangle_distances(int count, int query_stride, __global const flo
         for (int j = 0; j < 16; ++j) {
           if (!near.s[j]) continue;
           VF d2 = triangle_gap2(triangles + TRIANGLE * (16 * (size_t)list[b] + j), p);
+          found = SEL(found, (VI)((int)(16 * list[b] + j)), d2 < best);
           best = SEL(best, d2, d2 < best);
         }
       }
@@ -75,4 +78,5 @@ __kernel void triangle_distances(int count, int query_stride, __global const flo
     margin = worst < 1e29f ? sqrt(worst) * 1.0001f + 1e-9f : 2.0f * margin;
   }
   ((__global VF *)out)[packet] = VSQRT(best);
+  ((__global VI *)nearest)[packet] = found;
 }

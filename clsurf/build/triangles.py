@@ -1,18 +1,23 @@
-"""Distances from points to triangle meshes."""
+"""Nearest triangles of meshes."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..build.point_tree import BLOCK, build_boxes, column_bounds, morton_order
 from ..device import Device
 from ..errors import InputError
+from .point_tree import BLOCK, build_boxes, column_bounds, morton_order
 
 TRIANGLE = 12  # floats a triangle (triangle_distances.cl)
 BATCH = 1 << 22  # queries of one launch
 
 
 def triangle_distances(vertices: NDArray, faces: NDArray, points: NDArray, device: Device) -> NDArray:
-    """Return the distances (n,) float64 of points to the nearest triangle.
+    """Return the distances (n,) float64 of points to the nearest triangle; see `nearest_triangles`."""
+    return nearest_triangles(vertices, faces, points, device)[0]
+
+
+def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device: Device) -> tuple[NDArray, NDArray]:
+    """Return the distances (n,) float64 of points to the nearest triangle, and its number (n,) int64.
 
     Parameters
     ----------
@@ -28,7 +33,8 @@ def triangle_distances(vertices: NDArray, faces: NDArray, points: NDArray, devic
         No face with finite corners.
     """
     corners = np.asarray(vertices, np.float64)[faces]
-    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    kept = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
+    corners = corners[kept]
     if not len(corners):
         raise InputError("surface: expected a mesh with faces, got none with finite corners")
     box = column_bounds(corners.reshape(-1, 3))
@@ -36,7 +42,7 @@ def triangle_distances(vertices: NDArray, faces: NDArray, points: NDArray, devic
     corners = (corners - middle) / unit
     centroid = corners.mean(axis=1)
     order, _, _ = morton_order(np.ascontiguousarray(centroid, np.float32), device)
-    corners, centroid = corners[order], centroid[order]
+    corners, centroid, kept = corners[order], centroid[order], kept[order]
     padded = -(-len(order) // BLOCK) * BLOCK
     records = np.zeros((padded, TRIANGLE), np.float32)
     records[:len(order), :3] = corners[:, 0]
@@ -48,16 +54,17 @@ def triangle_distances(vertices: NDArray, faces: NDArray, points: NDArray, devic
     on_device = device.upload(balls)
     tree = (device.upload(records), padded, on_device,
             *build_boxes(on_device, padded, device, radius=device.upload(balls[3])))
-    kernel = device.kernel("analysis/triangle_distances.cl")
+    kernel = device.kernel("build/triangle_distances.cl")
     margin = float(np.median(radius))
-    out = np.empty(len(points))
+    out, number = np.empty(len(points)), np.empty(len(points), np.int64)
     for start in range(0, len(points), BATCH):
         local = np.ascontiguousarray((np.asarray(points[start:start + BATCH], np.float64) - middle) / unit, np.float32)
         order, _, _ = morton_order(local, device)
         stride = -(-len(local) // BLOCK) * BLOCK
         queries = np.zeros((3, stride), np.float32)
         queries[:, :len(local)] = local[order].T
-        found = device.empty(stride, np.float32)
-        kernel((stride // BLOCK,), (1,), len(local), stride, device.upload(queries), *tree, margin, found)
+        found, at = device.empty(stride, np.float32), device.empty(stride, np.int32)
+        kernel((stride // BLOCK,), (1,), len(local), stride, device.upload(queries), *tree, margin, found, at)
         out[start + order] = device.download(found, copy=False)[:len(local)]
-    return out * unit
+        number[start + order] = kept[device.download(at, copy=False)[:len(local)]]
+    return out * unit, number

@@ -1,0 +1,293 @@
+"""What every device must agree on: jobs that between them run every kernel, and the arrays they give.
+
+The surfaces that are drawn, traced and measured are made once, so that a difference is of the kernel that is looked at
+and not of a build before it. `python -m bench.answers FILE [--surfaces FILE]` runs the jobs on one device in a process
+of its own, which is how the job `devices` and the memory checks under Oclgrind use them.
+"""
+
+import argparse
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+import clsurf
+from clsurf.surface.mesh import Mesh
+from clsurf.surface.ranges import RangeImage, RangeScan
+
+KINDS = ("contours", "suggestive_contours", "ridges", "valleys", "parabolic")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large the scenes are: "tiny" for checkers that take a thousand times longer, "small" for comparisons."""
+
+    points: int
+    picture: tuple[int, int]
+    rays: int
+
+
+SIZES = {"tiny": Size(300, (40, 32), 40), "small": Size(20_000, (480, 360), 20_000)}
+
+
+def scans(size: Size) -> dict:
+    """Return the scans that the jobs read: a torus as cloud and mesh, a wavy range image."""
+    cloud = clsurf.models.torus(size.points)
+    ring = max(8, int(np.sqrt(2 * size.points)))
+    mesh = torus_mesh(ring, max(6, ring // 2))
+    return {"cloud": cloud, "mesh": mesh, "ranges": wavy_ranges(max(12, int(np.sqrt(size.points))))}
+
+
+def torus_mesh(around: int, across: int) -> Mesh:
+    """Return a closed, coloured mesh of the torus with radii 1 and 0.4."""
+    t, s = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(across) * 2 * np.pi / across, indexing="ij")
+    ring = 1 + 0.4 * np.cos(s)
+    points = np.stack([ring * np.cos(t), ring * np.sin(t), 0.4 * np.sin(s)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    here, on = i * across + j, (i + 1) % around * across + j
+    up, both = i * across + (j + 1) % across, (i + 1) % around * across + (j + 1) % across
+    faces = np.stack([here, on, both, here, both, up], axis=-1).reshape(-1, 3)
+    colors = np.full((len(points), 4), 255, np.uint8)
+    colors[:, :3] = 40 + 180 * (points - points.min(axis=0)) / np.ptp(points, axis=0)
+    return Mesh(points, faces, colors=colors)
+
+
+def wavy_ranges(n: int) -> RangeScan:
+    """Return one coloured depth image of a wavy sheet with a step in it."""
+    y, x = np.mgrid[:n, :n]
+    depth = (2 + 0.1 * np.sin(6 * x / n) * np.cos(4 * y / n) + 0.4 * (x > n // 2)).astype(np.float32)
+    depth[:2, :3] = np.nan
+    color = np.zeros((n, n, 4), np.uint8)
+    color[..., 0], color[..., 1], color[..., 3] = 255 * x // n, 255 * y // n, 255
+    intrinsics = np.array([[n, 0, n / 2], [0, n, n / 2], [0, 0, 1.0]])
+    return RangeScan([RangeImage(depth=depth, intrinsics=intrinsics, color=color, pose=np.eye(4))])
+
+
+def surfaces(device, size: Size) -> dict:
+    """Return the surfaces that the jobs draw and measure, made on `device`."""
+    given = scans(size)
+    made = {f"slim{degree}": clsurf.build_slim(given["mesh"], degree=degree, error=0.02, device=device)
+            for degree in (1, 2, 3)}
+    made["patches"] = clsurf.build_patches(given["mesh"], patches=max(12, size.points // 200), nodes=9, device=device)
+    return made
+
+
+JOBS: dict[str, Callable] = {}
+
+
+def job(function):
+    """Enter ``function(device, size, surfaces) -> arrays by name`` as the job of its name."""
+    JOBS[function.__name__] = function
+    return function
+
+
+def camera(size: Size):
+    """Return the camera of every picture: the torus from above, with some of its inside."""
+    return clsurf.Camera.look_at((1.3, -2.2, 2.4), (0, 0, 0), up=(0, 0, 1), fov=40)
+
+
+def channels_of(frame) -> dict:
+    """Return the channels of a frame."""
+    return dict(frame.channels)
+
+
+@job
+def normals(device, size, made):
+    """Neighbours, normals and their orientation, with fixed and with chosen k."""
+    cloud = clsurf.PointCloud(clsurf.models.torus(size.points).points)
+    return {f"k_{k}": clsurf.estimate_normals(cloud, k=k, device=device).normals for k in ("auto", 8, 30)}
+
+
+@job
+def build_slim(device, size, made):
+    """SLIM surfaces of every degree, with colours, weights and from range images."""
+    given, out = scans(size), {}
+    for degree in (1, 2, 3):
+        built = clsurf.build_slim(given["mesh"], degree=degree, error=0.02, device=device)
+        out |= {f"centers{degree}": built.centers, f"coefficients{degree}": built.coefficients,
+                f"colors{degree}": built.colors, f"footprint{degree}": built.footprint}
+    auto = clsurf.build_slim(given["ranges"], error="auto", device=device)
+    return out | {"auto": auto.centers}
+
+
+@job
+def build_patches(device, size, made):
+    """Spatial patches from a mesh, a cloud in both ways, and range images."""
+    given, out = scans(size), {}
+    count = max(12, size.points // 200)
+    for name, scan, options in (("areas", given["mesh"], {"patches": count}), ("local", given["cloud"], {}),
+                                ("views", given["cloud"], {"method": "global_views", "views": 6}),
+                                ("precise", given["mesh"], {"patches": count, "precise": True}),
+                                ("ranges", given["ranges"], {})):
+        built = clsurf.build_patches(scan, nodes=9, device=device, **options)
+        out |= {f"{name}_displacements": built.displacements, f"{name}_origins": built.origins}
+    return out
+
+
+@job
+def draw_slim(device, size, made):
+    """Pictures of SLIM surfaces in both kernel forms, with every channel."""
+    out, plain = {}, ("color", "depth", "normal", "position", "id", "count", "level", "cost")
+    second = ("mean", "gaussian", "k1", "k2", "direction1", "direction2", "radial")
+    third = ("derivative1", "derivative2", "radial_derivative")
+    for lanes in (16, 1):
+        with clsurf.Renderer(device, lanes=lanes) as renderer:
+            for degree in (1, 2, 3):
+                extra = () if degree == 1 else second if degree == 2 else (*second, *third)
+                frame = renderer.render(made[f"slim{degree}"], camera(size), size.picture, (*plain, *extra))
+                out |= {f"{name}_{degree}_{lanes}": array for name, array in frame.channels.items()}
+            for look in ("ball_size", "ball_level", "reflection", "flat"):
+                out[f"{look}_{lanes}"] = renderer.render(made["slim2"], camera(size), size.picture, ("color",),
+                                                         shading=look).color
+            far = clsurf.Camera.look_at((0, -40, 20), (0, 0, 0))
+            out[f"depth_far_{lanes}"] = renderer.render(made["slim2"], far, size.picture, ("depth",), lod=30).depth
+            out[f"function_{lanes}"] = renderer.render(made["slim2"], camera(size), size.picture, ("mean",),
+                                                       slim=clsurf.SlimDrawing("function")).mean
+            out[f"average_{lanes}"] = renderer.render(made["slim2"], camera(size), size.picture, ("color", "depth"),
+                                                      supersampling=2).color
+    return out
+
+
+@job
+def draw_patches(device, size, made):
+    """Pictures of patches in both kernel forms and in every mode."""
+    modes = {"plain": {}, "trilinear": {"nodes": "trilinear"}, "homogeneous": {"nodes": "homogeneous"},
+             "triangles": {"cells": "triangles"}, "bilinear": {"cells": "bilinear"}, "smooth": {"cells": "smooth"},
+             "gouraud": {"shading": "gouraud"}, "table": {"normal_table": True}, "ordered": {"normal_table": "ordered"},
+             "alpha": {"alpha": True}, "culled": {"cull": True}, "smooth_normals": {"normals": "smooth"}}
+    out = {}
+    for lanes in (16, 1):
+        with clsurf.Renderer(device, lanes=lanes) as renderer:
+            for name, options in modes.items():
+                frame = renderer.render(made["patches"], camera(size), size.picture,
+                                        patches=clsurf.PatchDrawing(**options))
+                out |= {f"{channel}_{name}_{lanes}": array for channel, array in frame.channels.items()}
+            both = renderer.render([made["patches"], made["slim2"]], camera(size), size.picture, ("id", "depth"))
+            far = renderer.render(made["patches"], clsurf.Camera.look_at((0, -30, 20), (0, 0, 0)), (24, 24), ("level",))
+            out |= {f"id_both_{lanes}": both.id, f"depth_both_{lanes}": both.depth, f"level_far_{lanes}": far.level}
+    return out
+
+
+@job
+def light(device, size, made):
+    """Shadows, ambient occlusion and a mirror, in both kernel forms."""
+    lamps = (clsurf.Light("directional", (1, 1, 2)), clsurf.Light("point", (2.0, -2.0, 3.0)))
+    shading = clsurf.Shading(shadows=True, occlusion=32, mirror=0.3)
+    scene = clsurf.Scene([made["slim2"], made["patches"].moved(raised(0.7))], lights=lamps)
+    out = {}
+    for lanes in (16, 1):
+        with clsurf.Renderer(device, lanes=lanes) as renderer:
+            out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.picture, ("color",),
+                                                    shading=shading).color
+    return out
+
+
+def raised(z: float) -> np.ndarray:
+    """Return the matrix that moves by `z` along the z axis."""
+    matrix = np.eye(4)
+    matrix[2, 3] = z
+    return matrix
+
+
+def rays(size: Size):
+    """Return origins around the torus and directions into it."""
+    origins = clsurf.models.sphere(size.rays, radius=3.0).points.astype(np.float64)
+    return origins, 0.3 * np.roll(origins, 1, axis=0) - origins
+
+
+@job
+def trace(device, size, made):
+    """Rays against every kind, for every query."""
+    origins, directions = rays(size)
+    things, out = {**made, "mesh": scans(size)["mesh"]}, {}
+    for name, thing in things.items():
+        for query in ("closest", "any", "all"):
+            hits = clsurf.trace(thing, origins, directions, query, device=device)
+            out[f"hit_{name}_{query}"] = hits.hit if query == "any" else hits.distance
+            if query == "closest":
+                out[f"primitive_{name}"] = hits.primitive
+    return out
+
+
+@job
+def project(device, size, made):
+    """The nearest places on a surface, and distances between scans and surfaces."""
+    points = clsurf.models.sphere(size.rays, radius=1.2).points.astype(np.float64)
+    found = {degree: clsurf.project(made[f"slim{degree}"], points, device=device) for degree in (1, 2, 3)}
+    error = clsurf.error(made["patches"], scans(size)["mesh"], device=device)
+    return {f"position{degree}": value.position for degree, value in found.items()} | {"error": np.array([error.rms])}
+
+
+@job
+def curvature(device, size, made):
+    """Curvature of a scan and of a surface at points."""
+    given = scans(size)
+    found = clsurf.curvature(given["cloud"], device=device)
+    return {"mean": found.mean, "gaussian": found.gaussian,
+            "surface_mean": clsurf.curvature(made["slim2"], given["cloud"].points, device=device).mean}
+
+
+@job
+def smooth(device, size, made):
+    """A mesh and a cloud without their noise."""
+    given = scans(size)
+    noise = 0.004 * np.sin(np.arange(3 * len(given["mesh"].vertices)) * 12.9898).reshape(-1, 3)
+    rough = Mesh(given["mesh"].vertices + noise, given["mesh"].faces)
+    cloud = clsurf.PointCloud(rough.vertices)
+    out = {method: clsurf.smooth(rough, method=method, device=device).vertices for method in ("normals", "quadrics")}
+    return out | {"cloud": clsurf.smooth(cloud, device=device).points}
+
+
+@job
+def lines(device, size, made):
+    """Feature lines of a picture, drawn over it."""
+    frame = clsurf.render(made["slim3"], camera(size), size.picture, ("color", *clsurf.line_channels(KINDS)),
+                          device=device)
+    found = clsurf.lines(frame, KINDS, device=device)
+    return {"points": found.points, "drawn": found.draw(frame).color}
+
+
+def digest(array) -> str:
+    """Return the first digits of a hash of an array's type, shape and bytes."""
+    array = np.ascontiguousarray(array)
+    return hashlib.sha256(f"{array.dtype} {array.shape}".encode() + array.tobytes()).hexdigest()[:12]
+
+
+def answers(device, size: Size, made: dict, names=None) -> dict[str, np.ndarray]:
+    """Return the arrays of the jobs `names` (by default all), named "job/array"."""
+    return {f"{name}/{key}": np.asarray(array) for name in (names or JOBS)
+            for key, array in JOBS[name](device, size, made).items() if array is not None}
+
+
+def main(arguments=None) -> None:
+    """Run jobs on one device; write their arrays."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("file", help="the arrays, .npz")
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--size", choices=SIZES, default="small")
+    parser.add_argument("--jobs", default="", help="some of them, with commas: " + ", ".join(JOBS))
+    parser.add_argument("--surfaces", help="folder of surfaces that another device has made")
+    parser.add_argument("--lanes", type=int, help="another form of the kernels than the device's own")
+    chosen = parser.parse_args(arguments)
+    device, size = clsurf.open_device(chosen.device), SIZES[chosen.size]
+    device.lanes = chosen.lanes or device.lanes
+    made = surfaces(device, size) if chosen.surfaces is None else load_surfaces(chosen.surfaces)
+    names = [name for name in chosen.jobs.split(",") if name] or None
+    np.savez_compressed(chosen.file, **answers(device, size, made, names))
+
+
+def save_surfaces(folder, made: dict) -> None:
+    """Write the surfaces into a folder."""
+    for name, surface in made.items():
+        clsurf.save(surface, f"{folder}/{name}.clsurf")
+
+
+def load_surfaces(folder) -> dict:
+    """Return the surfaces of a folder by name."""
+    from pathlib import Path
+    return {path.stem: clsurf.load(path) for path in sorted(Path(folder).glob("*.clsurf"))}
+
+
+if __name__ == "__main__":
+    main()

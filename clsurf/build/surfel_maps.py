@@ -1,0 +1,78 @@
+"""Normal maps of a surfel hierarchy, on the device: Holst and Schumann, section 4.
+
+Kernels: kernels/build/normal_maps.cl (Algorithm 1), triangle_maps.cl (Algorithm 2).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device import Device
+from ..surface.srgb import premultiplied, to_srgb
+from ..surface.surfel import COVERED, encoded_normals
+
+LARGEST_MAP = 64  # texels along a side: what a work-item keeps in private memory
+LIGHT_STEPS = 8192  # kernels/build/surfel_maps.clh
+LAUNCHES = 8  # of the maps: between them progress is told and the build may stop
+
+
+def draw_maps(device: Device, parts: dict, inner: int, size: int, report) -> tuple[NDArray, NDArray | None, NDArray,
+                                                                                 NDArray]:
+    """Return the atlas of normals, that of colours or None, and offset and size (n,) of every surfel's map.
+
+    Parameters
+    ----------
+    parts : dict
+        Fields of the `SurfelHierarchy` without its maps; colours, where there are any, in "lights" (n, 4) and, in the
+        hybrid form, "vertex_lights" (v, 4): premultiplied linear light.
+    inner : int
+        Surfels 0 to `inner` - 1 have maps of `size` texels along a side, the others of one.
+    report : callable
+        report(done), from 0 to 1.
+    """
+    n, texels = len(parts["positions"]), size * size
+    hybrid, lights = parts.get("triangles") is not None, parts.get("lights")
+    device.check_memory(normal_maps=4 * inner * texels, color_maps=0 if lights is None else 4 * inner * texels,
+                        surfels=64 * n, mesh=40 * len(parts["vertices"]) if hybrid else 0)
+    nodes = np.concatenate([parts["positions"], parts["spheres"][:, None], parts["normals"], parts["radii"][:, None]],
+                           axis=1).astype(np.float32)
+    offset = parts["child_offset"].astype(np.int64)
+    child = np.append(parts["children"], 0)
+    below = np.stack([child[np.minimum(offset[:-1], len(child) - 1)], np.diff(offset)], axis=1).astype(np.int32)
+    most, levels = int(np.diff(offset).max(initial=1)), int(parts["level"].max(initial=1))
+    constants = {"VW": device.lanes, "MAP_SIZE": size, "HAS_COLOR": lights is not None, "STACK": most * levels + 1}
+    unused = device.zeros((4,), np.float32)
+    up = lambda array, dtype=np.float32: unused if array is None else device.upload(  # noqa: E731
+        np.ascontiguousarray(array, dtype))
+    codes = np.rint(255 * to_srgb(np.arange(LIGHT_STEPS) / (LIGHT_STEPS - 1))).astype(np.uint8)
+    normals = device.empty((max(inner * texels, 1), 4), np.uint8)
+    colors = unused if lights is None else device.empty((max(inner * texels, 1), 4), np.uint8)
+    arguments = [device.upload(nodes), device.upload(below)]
+    if hybrid:
+        first = parts["triangle_offset"].astype(np.int64)
+        arguments += [device.upload(np.stack([first[:-1], np.diff(first)], axis=1).astype(np.int32)),
+                      up(parts["vertices"]), up(parts["vertex_normals"]), up(parts["triangles"], np.int32),
+                      up(parts.get("vertex_lights"))]
+    arguments += [up(lights), device.upload(codes), normals, colors]
+    kernel = device.kernel("build/triangle_maps.cl" if hybrid else "build/normal_maps.cl", constants=constants)
+    # Every launch has its share of the coarse surfels, whose maps see the most base surfels.
+    step = min(LAUNCHES, max(inner, 1))
+    for part in range(step if inner else 0):
+        maps = -(-(inner - part) // step)
+        kernel((maps * (texels if device.lanes == 1 else 1),), (64,) if device.lanes == 1 else (1,), part, step, inner,
+               *arguments)
+        device.finish()
+        report((part + 1) / step)
+    own = np.full((n - inner, 4), COVERED, np.uint8)
+    own[:, :3] = encoded_normals(parts["normals"][inner:])
+    atlas = np.concatenate([device.download(normals, copy=False)[:inner * texels], own])
+    color_atlas = None
+    if lights is not None:
+        color_atlas = np.concatenate([device.download(colors, copy=False)[:inner * texels], parts["colors"][inner:]])
+    sizes = np.where(np.arange(n) < inner, size, 1).astype(np.int32)
+    area = sizes.astype(np.int64) ** 2
+    return atlas, color_atlas, (np.cumsum(area) - area).astype(np.int32), sizes
+
+
+def light_of(colors: NDArray | None) -> NDArray | None:
+    """Return premultiplied linear light (n, 4) float32 of sRGB colours (n, 4) uint8; None stays None."""
+    return None if colors is None else premultiplied(colors).astype(np.float32)

@@ -1,0 +1,58 @@
+"""The command `view`: look at surfaces and scans interactively."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import InputError
+from .cameras import DirectionOption, EyeOption, FovOption, OrthoOption, TargetOption, UpOption, checked_view
+from .common import DeviceOption, QuietOption, SizeOption, Steps, parsed_size
+from .motion import CameraOption, IgnoreOption, camera_of
+from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, SpacingOption, recipe
+
+BackendOption = Annotated[str, typer.Option(help="window, browser, terminal, or auto: a window where there is a "
+                                            "display, else the browser.")]
+HostOption = Annotated[str, typer.Option(help="browser: where it is served; 0.0.0.0: to other machines too, to whoever "
+                                         "has the URL with its token.")]
+PortOption = Annotated[int, typer.Option(min=0, max=65535, help="browser: 0 takes a free one.")]
+
+
+def view(sources: Annotated[list[Path], typer.Argument(help="Surfaces or scans, shown in one scene.",
+                                                       metavar="FILE...")],
+         backend: BackendOption = "auto", host: HostOption = "127.0.0.1", port: PortOption = 0,
+         folder: Annotated[Path, typer.Option(help="Where screenshots go.")] = Path("."),
+         size: SizeOption = "1024x768", direction: DirectionOption = "", up: UpOption = "0,1,0",
+         fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
+         camera: CameraOption = "", ignore_distortion: IgnoreOption = False,
+         kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
+         spacing: SpacingOption = None, device: DeviceOption = "", quiet: QuietOption = False):
+    """Look at surfaces and scans: turn, measure, cut, take pictures; h shows the keys."""
+    import clsurf
+
+    from ..render.renderer import checked_size
+    from ..view.canvas import BACKENDS, backend_module, chosen_backend
+    from .pictures import loaded_surface
+    # Every option is checked before the work.
+    steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
+    seen_from = checked_view(direction, up, fov, eye, target, ortho)
+    plain = not (direction or eye or target) and fov is None and ortho is None
+    if camera and not plain:
+        raise InputError("camera: expected --camera or options of a camera (--direction, --fov, --eye, --target, "
+                         "--ortho), got both")
+    if backend in ("notebook", "offscreen") or backend not in BACKENDS:
+        raise InputError(f"backend: expected window, browser, terminal or auto, got {backend!r}")
+    chosen = chosen_backend(backend)
+    backend_module(chosen)
+    if not folder.is_dir():
+        raise InputError(f"folder {folder}: expected an existing folder for screenshots")
+    given = camera_of(camera, "ignore" if ignore_distortion else "refuse") if camera else None
+    how = recipe(kind, degree, error, patches=patches, spacing=spacing)
+    opened = clsurf.open_device(device or None)
+    things = [loaded_surface(source, how, opened, steps) for source in sources]
+    scene = clsurf.Scene(things)
+    seen = given if given or plain else seen_from.camera(scene, picture_size)
+    viewer = clsurf.view(scene, seen, chosen, picture_size, seen_from.up, host, port, folder, opened,
+                         None if chosen != "terminal" else lambda line: None)
+    if viewer.distance is not None and chosen == "terminal":
+        print(f"distance {viewer.distance:.9g}")

@@ -1,0 +1,190 @@
+"""Faults around clsurf: forks and threads, full disks, caches that cannot be written, devices that fail, Ctrl-C."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import types
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clsurf
+from clsurf.device import open_device
+from clsurf.device.program import Kernel
+from clsurf.errors import DeviceError, DeviceMemoryError
+
+SIZE = (48, 40)
+
+
+@pytest.fixture(scope="module")
+def slim(device):
+    return clsurf.build_slim(clsurf.models.torus(1500), error=0.02, device=device)
+
+
+def picture(slim, device):
+    return clsurf.render(slim, size=SIZE, device=device).color
+
+
+def draw_in_child(slim, selector, answers):
+    answers.put(picture(slim, selector))
+
+
+@pytest.mark.parametrize("how", ["fork", "spawn"])
+def test_processes_draw_what_their_parent_drew(slim, device, how):
+    """PoCL's threads are not copied by a fork: without care the child waits for ever."""
+    wanted = picture(slim, device)
+    selector = os.environ.get("CLSURF_DEVICE") or "pocl"
+    context = multiprocessing.get_context(how)
+    answers = context.Queue()
+    child = context.Process(target=draw_in_child, args=(slim, selector, answers))
+    child.start()
+    got = answers.get(timeout=240)
+    child.join(60)
+    assert child.exitcode == 0
+    np.testing.assert_array_equal(got, wanted)
+
+
+def draw_with(device, slim, renderer, answers):
+    answers.put(picture(slim, device))
+    try:
+        renderer.render(slim, size=SIZE)
+        answers.put("drawn")
+    except DeviceError as error:
+        answers.put(str(error))
+
+
+def test_what_a_fork_inherits(slim, device):
+    """An opened device is opened anew in a child; a renderer says what to do."""
+    context = multiprocessing.get_context("fork")
+    answers = context.Queue()
+    with clsurf.Renderer(device) as renderer:
+        child = context.Process(target=draw_with, args=(device, slim, renderer, answers))
+        child.start()
+        np.testing.assert_array_equal(answers.get(timeout=240), picture(slim, device))
+        assert "make a new Renderer" in answers.get(timeout=60)
+        child.join(60)
+    assert child.exitcode == 0
+
+
+def test_renderers_in_threads(slim, device):
+    """Threads that draw at once get the picture that one alone gets."""
+    wanted, got = picture(slim, device), []
+
+    def draw():
+        with clsurf.Renderer(device) as renderer:
+            got.extend(renderer.render(slim, size=SIZE).color for _ in range(4))
+    threads = [threading.Thread(target=draw) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(240)
+    assert len(got) == 16
+    for color in got:
+        np.testing.assert_array_equal(color, wanted)
+
+
+SAVE = """
+import resource, signal, sys
+import clsurf, numpy as np
+from clsurf.surface.mesh import Mesh
+cloud = clsurf.models.sphere(20_000)
+mesh = Mesh(cloud.points, np.arange(19_998).reshape(-1, 3))
+frame = clsurf.Frame({"color": np.random.default_rng(1).random((200, 200, 4)).astype("f4")})
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+for path in sys.argv[1:]:
+    ending = path.rsplit(".", 1)[1]
+    try:
+        if ending in ("png", "exr", "jpg"):
+            frame.save(path)
+        else:
+            clsurf.save(mesh if ending in ("obj", "stl", "off", "glb") else cloud, path)
+        print("saved", path)
+    except clsurf.Error as error:
+        print("refused" if chr(10) not in str(error) else "lines", path)
+"""
+
+
+def test_a_full_disk_leaves_nothing_and_loses_nothing(tmp_path):
+    """Files may have 20 KB, as on a disk with no more room: every writer says so, and the old file stays."""
+    paths = [tmp_path / f"a.{ending}" for ending in ("ply", "obj", "stl", "off", "glb", "xyz", "npy", "las", "laz",
+                                                     "clsurf", "png", "exr", "jpg")]
+    for path in paths:
+        path.write_text("old")
+    done = subprocess.run([sys.executable, "-c", SAVE, *map(str, paths)], capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["refused"] * len(paths), done.stdout
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    assert all(path.read_text() == "old" for path in paths)
+
+
+def test_a_cache_that_cannot_be_written(tmp_path):
+    """A file where the cache folder should be: clsurf takes another place and draws."""
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    environment = {**os.environ, "XDG_CACHE_HOME": str(blocked), "HOME": str(blocked), "TMPDIR": str(tmp_path)}
+    environment.pop("POCL_CACHE_DIR", None)
+    text = "import clsurf; print(clsurf.render(clsurf.build_slim(clsurf.models.sphere(300)), size=(8, 8)))"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=240, env=environment)
+    assert done.returncode == 0 and done.stdout.startswith("Frame(8 x 8"), done.stderr
+
+
+@pytest.mark.parametrize("code, kind", [(cl.status_code.OUT_OF_RESOURCES, DeviceMemoryError),
+                                        (cl.status_code.DEVICE_NOT_AVAILABLE, DeviceError)])
+def test_a_device_that_fails_in_the_middle(slim, monkeypatch, code, kind):
+    """A launch that fails is one of clsurf's errors; the next call works, on a new context where the device was lost."""
+    selector = os.environ.get("CLSURF_DEVICE") or "pocl"
+    device = open_device(selector)
+    wanted = picture(slim, device)
+    launches, launch = [], Kernel._launch
+
+    def failing(self, *arguments):
+        launches.append(self.label)
+        if len(launches) == 3:
+            raise cl.RuntimeError(types.SimpleNamespace(code=lambda: code, what=lambda: "launch", routine=lambda: ""))
+        return launch(self, *arguments)
+    monkeypatch.setattr(Kernel, "_launch", failing)
+    with pytest.raises(kind, match="clsurf devices") as caught:
+        picture(slim, device)
+    assert "\n" not in str(caught.value)
+    monkeypatch.undo()
+    again = open_device(selector)
+    assert (again is device) == (kind is DeviceMemoryError)
+    np.testing.assert_array_equal(picture(slim, again), wanted)
+
+
+def test_too_little_device_memory_is_told_and_forgotten(slim, device, monkeypatch):
+    """A limit met between two frames: one clear error, nothing kept, and the frame after it is whole."""
+    wanted = picture(slim, device)
+    monkeypatch.setattr(device, "largest_buffer_bytes", 1000)
+    with pytest.raises(DeviceMemoryError, match="one buffer may have"):
+        clsurf.Renderer(device).render(slim, size=SIZE)
+    monkeypatch.undo()
+    np.testing.assert_array_equal(picture(slim, device), wanted)
+
+
+INTERRUPTED = """
+import os, sys, clsurf
+slim = clsurf.build_slim(clsurf.models.torus(3000))
+print("ready", flush=True)
+try:
+    while True:
+        frame = clsurf.render(slim, size=(640, 480))
+except KeyboardInterrupt:
+    print("stopped", clsurf.render(slim, size=(8, 8)), flush=True)
+"""
+
+
+def test_ctrl_c_in_the_middle_of_frames():
+    """Ctrl-C ends a loop of frames at once, and the renderer still works."""
+    with subprocess.Popen([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, text=True) as work:
+        assert work.stdout.readline() == "ready\n"
+        time.sleep(1)
+        work.send_signal(signal.SIGINT)
+        assert work.stdout.readline().startswith("stopped Frame(8 x 8")
+        assert work.wait(60) == 0
