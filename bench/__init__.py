@@ -23,6 +23,7 @@ JOBS = {
     "devices": "one answer everywhere: hashes of all devices' answers and how far they are apart",
     "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",
     "scale_map": "spherical scale maps: closed forms and orders, builds, frames, geospheres, morphs",
+    "stream": "scans larger than memory: time, peak memory, autzen's points within 0.3 m, scaling to 50 million points",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
 

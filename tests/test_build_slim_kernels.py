@@ -128,13 +128,13 @@ def test_choose_centers(tree, sorted_points, spacing):
 LAMBDA = 1e-8
 
 
-def fitted(tree, degree, centers, r_r, penalty=1e-9, mode=slim.SEGMENT):
+def fitted(tree, degree, centers, r_r, penalty=1e-9, mode=slim.SEGMENT, tolerance=np.inf):
     device = tree.device
     need = 2 * twin.terms(min(degree, 2)) + 2
     out = device.empty((len(centers), slim.RECORD), np.float32)
     kernel = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree})
     kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, LAMBDA, penalty, 0.02, need,
-           mode, np.inf, *tree.arguments, out)
+           mode, tolerance, *tree.arguments, out)
     return device.download(out), need
 
 
@@ -218,7 +218,8 @@ def test_sparse_ball(tree):
     assert (record[:, 5] == 1).all() and (record[:, 0] > 1e-4).all() and np.isfinite(record[:, :12]).all()
 
 
-def test_cover_points(tree, sorted_points):
+@pytest.mark.parametrize("tolerance", (np.inf, 3e-4))
+def test_cover_points(tree, sorted_points, tolerance):
     points, normals = sorted_points
     device, centers = tree.device, np.arange(0, tree.count, 40)
     record, _ = fitted(tree, 2, centers, 0.1)
@@ -226,11 +227,54 @@ def test_cover_points(tree, sorted_points):
     record[::5, 1:4] *= -1  # leaves that face away represent only their own centre
     overlap, held = device.zeros(tree.padded, np.uint32), device.zeros(tree.padded, np.uint8)
     device.kernel("build/cover_points.cl")((len(centers),), (1,), len(centers), device.upload(centers, np.int32),
-                                           device.upload(record), np.inf, 6, *tree.arguments, overlap, held)
-    expected, expected_held = twin.cover_points(points, normals, centers, record)
+                                           device.upload(record), tolerance, 6, *tree.arguments, overlap, held)
+    expected, expected_held = twin.cover_points(points, normals, centers, record, tolerance=tolerance)
     got = device.download(overlap)[:tree.count] / slim.OVERLAP_ONE
     assert (np.abs(got - expected) < 3e-4).all()
     assert ((device.download(held)[:tree.count] != 0) != expected_held).mean() < 0.002
+
+
+def test_cover_leaves(tree, sorted_points):
+    points, normals = sorted_points
+    device, centers = tree.device, np.arange(0, tree.count, 40)
+    record, _ = fitted(tree, 2, centers, 0.1)
+    place = (points[centers] + 0.004).astype(np.float32)
+    overlap, held = device.zeros(tree.padded, np.uint32), device.zeros(tree.padded, np.uint8)
+    device.kernel("build/cover_leaves.cl")((len(place),), (1,), len(place), device.upload(place), device.upload(record),
+                                           5e-3, 6, *tree.arguments, overlap, held)
+    expected, _ = twin.cover_leaves(points, normals, place, record, tolerance=5e-3)
+    # Points that are as far off as the tolerance, to rounding, may fall either way.
+    assert (np.abs(device.download(overlap)[:tree.count] / slim.OVERLAP_ONE - expected) < 3e-4).mean() > 0.999
+    assert 0.1 < (expected > 0).mean() < 1
+
+
+def test_check_leaves(tree, sorted_points):
+    points, _ = sorted_points
+    device, centers = tree.device, np.arange(0, tree.count, 40)
+    record, _ = fitted(tree, 2, centers, 0.14)
+    place = (points[centers] + 0.004).astype(np.float32)
+    own = np.zeros(tree.padded, np.uint8)
+    own[:tree.count] = points[:, 0] > 0
+    sums = device.empty((len(place), 2), np.float32)
+    device.kernel("build/check_leaves.cl")(
+        (len(place),), (1,), len(place), device.upload(place), device.upload(record), 6, tree.padded, tree.sorted,
+        device.upload(own), *tree.arguments[2:], sums)
+    expected = twin.check_leaves(points, own[:tree.count], place, record)
+    assert np.allclose(device.download(sums), expected, rtol=2e-4, atol=1e-7)
+    assert (expected[:, 0] == 0).any() and (expected[:, 0] > 5).any()
+
+
+@pytest.mark.parametrize("tolerance", (1e-3, 1e-4))
+def test_tolerance_of_fits(tree, sorted_points, tolerance):
+    """A leaf keeps half the tolerance in its mean error and comes near its centre, or is a disc at the centre."""
+    centers = np.arange(0, tree.count, 10)
+    record, _ = fitted(tree, 2, centers, 0.14, tolerance=tolerance)
+    free, _ = fitted(tree, 2, centers, 0.14)
+    disc = (record[:, 6:] == 0).all(axis=1) & (record[:, 5] > 0)
+    leaf = (record[:, 5] > 0) & ~disc
+    assert (record[leaf, 4] <= 0.5 * tolerance * 1.01).all() and (np.abs(record[leaf, 6]) <= tolerance).all()
+    assert (record[leaf] == free[leaf]).all()
+    assert np.allclose(record[disc, 1:4], sorted_points[1][centers[disc]], atol=1e-5)
 
 
 def test_neighbor_spread(tree, sorted_points):

@@ -56,7 +56,7 @@ def test_frames_of_a_path(device, cluster, tmp_path):
         with distributed.Client(cluster) as client:
             frames = list(clsurf.render_frames(tmp_path / "a.clsurf", cameras, (64, 48), device=name,
                                                scheduler=client))
-    expected = list(clsurf.render_frames(surface, cameras, (64, 48), device=device))
+    expected = list(clsurf.render_frames(clsurf.load(tmp_path / "a.clsurf"), cameras, (64, 48), device=device))
     assert len(frames) == 3
     for got, wanted in zip(frames, expected, strict=True):
         assert np.array_equal(got.depth, wanted.depth, equal_nan=True) and np.array_equal(got.color, wanted.color)

@@ -216,7 +216,7 @@ def test_bytes_cut_and_flipped(tmp_path, data):
 
 def test_failed_write_leaves_nothing(tmp_path, monkeypatch):
     path = tmp_path / "a.clsurf"
-    monkeypatch.setattr("clsurf.io.store._create", lambda *a: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr("clsurf.io.store.create_array", lambda *a: (_ for _ in ()).throw(OSError(28, "No space left")))
     with pytest.raises(InputError, match="no space"):
         save(random_surface(2), path)
     assert not list(tmp_path.iterdir())

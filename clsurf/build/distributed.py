@@ -9,36 +9,11 @@ import functools
 import threading
 from pathlib import Path
 
+from ..cluster import connect
 from ..errors import Error, InputError
 from .streamed import Build
 
 _RETRIES = 2  # of a task that fails; workers that end in mid-task are Dask's own matter
-
-
-def connect(scheduler):
-    """Return a client of a scheduler, an address such as "tcp://host:8786", "local", or a client; and what to close.
-
-    Raises
-    ------
-    InputError
-        No such scheduler, or Dask is not installed.
-    """
-    try:
-        import distributed
-    except ImportError:
-        raise InputError("scheduler: needs Dask: pip install clsurf[scale]") from None
-    if isinstance(scheduler, distributed.Client):
-        return scheduler, ()
-    try:
-        if scheduler == "local":
-            cluster = distributed.LocalCluster(threads_per_worker=1, dashboard_address=None)
-            client = distributed.Client(cluster)
-            return client, (client, cluster)
-        client = distributed.Client(scheduler, timeout=10)
-        return client, (client,)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"scheduler {scheduler!r}: expected an address such as tcp://host:8786, or local: "
-                         f"{error}") from None
 
 
 def step(folder: str, kind: str, number: int, device: str | None) -> int:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..device import open_device
 from ..errors import Cancelled, InputError
+from ..sizes import parse_bytes
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -28,7 +29,7 @@ class PatchRequest:
 
 
 def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=None, method=None, precise=False,
-                  progress=None, device=None) -> PatchSurface:
+                  progress=None, device=None, memory_limit=None, out=None, scheduler=None) -> PatchSurface:
     """Turn a scan into spatial patches.
 
     Parameters
@@ -52,6 +53,9 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     progress : callable, optional
         Called as progress(stage, done) with done from 0 to 1; returning False stops the build.
     device : str, Device, ..., optional
+    memory_limit, out, scheduler
+        As of `build_slim`: a LAS, LAZ, COPC, PLY (without faces) or text scan is streamed to the .clsurf `out`, cell by
+        cell, within the memory; patches end where cells do. What is returned is read from there.
 
     Returns
     -------
@@ -68,9 +72,19 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     -----
     The paper on spatial patches, sections 4.1, 4.4 and 4.5; "local" and "ranges" are its future work.
     """
+    request = checked_request(nodes, patches, spacing, error, views, precise)
+    if isinstance(scan, str | PathLike) and method in (None, "local"):
+        from .slim import streamed_scan, wants_stream
+        limit = parse_bytes(memory_limit)
+        if wants_stream(scan, limit, out):
+            return streamed_scan(scan, out, limit, progress, device, patches=request, scheduler=scheduler)
     if not isinstance(scan, Mesh | PointCloud) and not hasattr(scan, "images"):
         scan = _loaded(scan)
-    request = checked_request(nodes, patches, spacing, error, views, precise)
+    if out is not None:
+        from ..io import save
+        surface = build_patches(scan, nodes, patches, spacing, error, views, method, precise, progress, device)
+        save(surface, out)
+        return surface
     method = _method_of(scan) if method is None else method
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")

@@ -6,7 +6,6 @@ Feature Extraction, and Smoothing", SGP 2005, section 2.
 
 import math
 import os
-import re
 import tempfile
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from ..device import open_device
 from ..errors import Cancelled, DeviceMemoryError, InputError
 from ..io import load, save
 from ..io.cleaning import first_of_duplicates
+from ..sizes import parse_bytes
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
@@ -90,7 +90,7 @@ def build_slim(scan, degree=2, error=None, weight=None, memory_limit=None, progr
     if isinstance(scan, str | os.PathLike):
         limit = parse_bytes(memory_limit)
         if weight is None and wants_stream(scan, limit, out):
-            return streamed_slim(scan, out, limit, progress, device, degree=degree, error=error or "auto",
+            return streamed_scan(scan, out, limit, progress, device, degree=degree, error=error or "auto",
                                  tolerance=tolerance, scheduler=scheduler)
         scan = load(scan)
     if scheduler is not None:
@@ -110,7 +110,12 @@ def build_slim(scan, degree=2, error=None, weight=None, memory_limit=None, progr
     report = Reporter(progress)
     report("points", 0.0)
     points = usable_points(scan, weight, device)
-    check_room(device, len(points.position), memory_limit, points)
+    try:
+        check_room(device, len(points.position), memory_limit, points)
+    except DeviceMemoryError:
+        if points.weights is not None or parse_bytes(memory_limit) is not None:
+            raise
+        return in_parts(points, scan.origin, degree, error, tolerance, report, device)
     box = robust_box(points.position)
     diagonal = float(np.linalg.norm(box[1] - box[0]))
     if not diagonal > 0:
@@ -141,17 +146,30 @@ def wants_stream(path, limit: int | None, out) -> bool:
     return limit is not None and LOADED_BYTES + count * BYTES_PER_LOADED_POINT > limit
 
 
-def streamed_slim(path, out, limit: int | None, progress, device, **options):
+def streamed_scan(path, out, limit: int | None, progress, device, **options):
     """Return the surface of a streamed scan: opened where `out` names its place, otherwise whole in memory."""
     from ..io.stored import StoredSurface
     from .streamed import build_streamed
     report = Reporter(progress)
     if out is not None:
-        return StoredSurface(build_streamed(path, out, memory_limit=limit, report=report, device=device, **options))
+        place = build_streamed(path, out, memory_limit=limit, report=report, device=device, **options)
+        return load(place) if "patches" in options else StoredSurface(place)
     with tempfile.TemporaryDirectory(prefix="clsurf-") as folder:
         place = build_streamed(path, Path(folder) / "surface.clsurf", memory_limit=limit, report=report, device=device,
                                **options)
         return load(place)
+
+
+def in_parts(points: Points, origin, degree: int, error, tolerance, report, device):
+    """Return the surface of points that the device does not hold at once, built cell by cell in a temporary folder."""
+    from ..io.chunks import CloudSource
+    from .stream_sizes import sizes_for
+    from .streamed import build_streamed
+    sizes = sizes_for(device)
+    source = CloudSource(points.position, points.normals, points.colors, origin, sizes.chunk)
+    with tempfile.TemporaryDirectory(prefix="clsurf-") as folder:
+        return load(build_streamed(source, Path(folder) / "surface.clsurf", degree, error, tolerance, report=report,
+                                   device=device, sizes=sizes))
 
 
 class Reporter:
@@ -236,17 +254,6 @@ def check_room(device, count: int, memory_limit, points: Points):
         raise DeviceMemoryError(f"memory_limit: the build of {count:,} points needs {needed / 1e6:.0f} MB, got "
                                 f"{limit / 1e6:.0f} MB: raise the limit or build from fewer points")
     device.check_memory(points=24 * count, tree=needed - 24 * count)
-
-
-def parse_bytes(value) -> int | None:
-    """Return a number of bytes from a number or a text such as "500MB" or "2 GB"; None stays None."""
-    if value is None:
-        return None
-    match = re.fullmatch(r"\s*([0-9.]+)\s*([kMGT]?)i?B?\s*", str(value))
-    try:
-        return int(float(match[1]) * 1000 ** " kMGT".index(match[2] or " "))
-    except (TypeError, ValueError):
-        raise InputError(f"memory_limit: expected bytes or a text such as '2GB', got {value!r}") from None
 
 
 def face_normals(points: NDArray, faces: NDArray) -> NDArray:

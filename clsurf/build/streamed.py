@@ -11,7 +11,7 @@ import logging
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from ..io.files import writable_place
 from ..io.layout import from_arrays, to_arrays
 from ..io.parts import part_folder, write_index, write_part
 from ..io.store import load_store
+from .patches import PatchRequest
 from .radius import Noise, automatic_error
 from .slim_levels import BOUND_SHARE, LEVELS
 from .stream_cells import (
@@ -36,40 +37,14 @@ from .stream_cells import (
     check_cell,
     checked,
 )
+from .stream_patches import no_patches
 from .stream_plan import LARGEST, Plan, box_of, cut_cells, first_fine_level, measure, thinning
 from .stream_runs import THINNED, Lattice, Runs, chunk_written, lattice_of, make_run, write_whole
+from .stream_sizes import KEPT_PER_POINT, Sizes, sizes_of, with_halo
 
 log = logging.getLogger("clsurf")
 
 VERSION = 1  # of the files in NAME.part: others are begun anew
-FIXED_BYTES = 330_000_000  # of a process with its driver and kernels
-BYTES_PER_CELL_POINT = 900  # at the peak of a cell's build, halo and the next cell's points counted in
-BYTES_PER_CHUNK_POINT = 400  # of the chunk at hand and the one read ahead
-MOST_CHUNK = 1_000_000
-KEPT_PER_POINT = 60  # bytes of the device's memory that are kept from cell to cell
-LEAST_POINTS, MOST_POINTS = 50_000, 1_000_000  # of a cell; larger ones have less halo, but nothing is gained beyond
-FLAT = 0.3  # height over extent below which an airborne cloud is seen from above
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much is taken at once, from the memory limit."""
-
-    chunk: int  # points read at once
-    cell: int  # points of a cell, without halo
-    thin: int  # points of the copy for the coarse levels
-
-
-def sizes_of(limit: int | None) -> Sizes:
-    """Return what fits in `limit` bytes; raises InputError where nothing does."""
-    limit = 2_000_000_000 if limit is None else limit
-    room = limit - FIXED_BYTES
-    cell = min(MOST_POINTS, room // BYTES_PER_CELL_POINT)
-    if cell < LEAST_POINTS:
-        least = FIXED_BYTES + LEAST_POINTS * BYTES_PER_CELL_POINT
-        raise InputError(f"memory_limit: expected at least {least / 1e6:.0f} MB, of which drivers and kernels take "
-                         f"{FIXED_BYTES / 1e6:.0f}, got {limit / 1e6:.0f} MB")
-    return Sizes(int(min(MOST_CHUNK, room // BYTES_PER_CHUNK_POINT)), int(cell), int(min(1_200_000, cell)))
 
 
 class Build:
@@ -135,11 +110,11 @@ class Build:
             raise InputError("scan: expected points with some extent, got all of them at one place")
         noise, neighbours = measure(runs, diagonal, self.device)
         error = automatic_error(noise) if self.options.error == "auto" else float(self.options.error)
-        cuts = cut_cells(runs.cells, runs.counts, self.sizes.cell)
-        thin = thinning(count, self.sizes.thin)
-        first = 1 if len(cuts) == 2 else first_fine_level(noise.spacing, thin)
-        reach = 2 * LARGEST * np.sqrt(thin / THINNED) * noise.spacing * diagonal
-        rings = 0 if len(cuts) == 2 else int(np.ceil(reach / runs.lattice.width))
+        thin, spacing, width = thinning(count, self.sizes.thin), noise.spacing * diagonal, runs.lattice.width
+        rings = int(np.ceil(2 * LARGEST * np.sqrt(thin / THINNED) * spacing / width))
+        cuts = cut_cells(runs.cells, runs.counts, with_halo(self.sizes.cell, rings * width / max(spacing, 1e-300)))
+        first = 1 if len(cuts) == 2 or self.options.patches is not None else first_fine_level(noise.spacing, thin)
+        rings = 0 if len(cuts) == 2 else rings
         _write_arrays(path, origin=origin, cuts=cuts, numbers=np.array([
             diagonal, noise.variance, noise.spacing, error, thin, first, rings, neighbours]))
 
@@ -183,6 +158,11 @@ class Build:
         if part_folder(self.folder, 0).exists():
             return
         coarse = self._made_coarse().surface
+        if self.options.patches is not None:
+            none = no_patches(self.plan, PatchRequest(*self.options.patches), coarse.colors is not None, coarse.origin)
+            self._describe(0, none, np.zeros(0, np.float32))
+            write_part(self.folder, 0, none)
+            return
         sums = np.zeros((len(coarse), 2))
         for number in range(self.plan.cells):
             with np.load(self.work / "checks" / f"{number:05d}.npz") as data:
@@ -208,7 +188,8 @@ class Build:
         if self.cell_written(number):
             return
         points = cell_points(self.runs, self.plan, number) if points is None else points
-        surface, distance = build_cell(points, self.plan, self.options, self._checked_coarse(), self.device)
+        total = int(self.runs.counts.sum())
+        surface, distance = build_cell(points, self.plan, self.options, self._checked_coarse(), self.device, total)
         self._describe(number + 1, surface, distance)
         write_part(self.folder, number + 1, surface)
         give_back()
@@ -221,12 +202,15 @@ class Build:
                 about.append({name: data[name] for name in data.files})
         bounds, surfels = (np.stack([one[name] for one in about]) for name in ("bounds", "surfels"))
         distance = np.concatenate([one["distance"] for one in about])
-        bound = float(np.quantile(distance, BOUND_SHARE)) if len(distance) else float("nan")
+        # Patches come with the bound of their cell: the largest holds for all.
+        share = BOUND_SHARE if self.options.patches is None else 1.0
+        bound = float(np.quantile(distance, share)) if len(distance) else float("nan")
         values = {"degree": self.options.degree, "error": self.plan.error, "diagonal": self.plan.diagonal,
                   "bound": bound if np.isfinite(bound) else None, "bound_share": BOUND_SHARE, "oriented": True,
                   "parts": len(about), "leaves": int(sum(one["leaves"] for one in about)),
                   "colored": bool(all(one["colored"] for one in about))}
-        write_index(self.folder, values, bounds, surfels)
+        kind = "slim" if self.options.patches is None else "patches"
+        write_index(self.folder, values, bounds, surfels, kind)
         shutil.rmtree(self.work)
         (self.folder / "job.json").unlink()
         if out.is_dir():
@@ -235,9 +219,11 @@ class Build:
 
     def _describe(self, part: int, surface, distance: NDArray) -> None:
         """Write what the index says of a part, before the part itself."""
-        surfels = np.bincount(surface.level, minlength=LEVELS + 1)[1:]
-        _write_arrays(self.work / "parts" / f"{part:05d}.npz", bounds=surface.bounds, surfels=surfels,
-                      leaves=surface.leaf.sum(), colored=surface.colors is not None, distance=distance)
+        slim = self.options.patches is None
+        surfels = np.bincount(surface.level, minlength=LEVELS + 1)[1:] if slim else np.array([len(surface)])
+        leaves = surface.leaf.sum() if slim else len(surface)
+        _write_arrays(self.work / "parts" / f"{part:05d}.npz", bounds=surface.bounds, surfels=surfels, leaves=leaves,
+                      colored=surface.colors is not None, distance=distance)
 
     # What was made ------------------------------------------------------------------------------------------------
 
@@ -278,11 +264,13 @@ def _write_surface(path: Path, surface, **more: NDArray) -> None:
 def begin(path, out: Path, options: Options, sizes: Sizes, device: Device) -> Build:
     """Return the build in OUT.part: the one that was begun there with the same scan and options, or a new one."""
     folder = out.with_name(out.name + ".part")
-    stat = Path(path).stat()
-    job = {"version": VERSION, "source": {"path": str(Path(path).resolve()), "size": stat.st_size,
-                                          "modified": stat.st_mtime_ns},
+    about = {"path": "", "size": 0, "modified": 0}  # of points in memory
+    if not isinstance(path, Source):
+        stat = Path(path).stat()
+        about = {"path": str(Path(path).resolve()), "size": stat.st_size, "modified": stat.st_mtime_ns}
+    job = {"version": VERSION, "source": about,
            "options": asdict(options), "sizes": asdict(sizes)}
-    text = json.dumps(job)
+    text = json.dumps(job)  # a tuple becomes a list: what is read is compared as text
     old = folder / "job.json"
     if folder.exists() and (not old.exists() or old.read_text() != text):
         if not (old.exists() or not any(folder.iterdir())):
@@ -297,22 +285,28 @@ def begin(path, out: Path, options: Options, sizes: Sizes, device: Device) -> Bu
 
 
 def build_streamed(path, out, degree=2, error="auto", tolerance=None, memory_limit=None, report=lambda *_: None,
-                   device=None, scheduler=None) -> Path:
+                   device=None, scheduler=None, sizes: Sizes | None = None, patches=None) -> Path:
     """Build a SLIM surface from a file larger than memory; return the folder of its store.
 
     Parameters
     ----------
+    path : path-like or Source
     report : callable
         report(stage, done) with done from 0 to 1; may raise to stop: what is done stays in OUT.part.
     scheduler : str or distributed.Client, optional
         Workers that take the steps; see `distributed`.
+    sizes : Sizes, optional
+        How much is taken at once, in place of what `memory_limit` says.
+    patches : PatchRequest, optional
+        Build patches, as `clsurf.build.patches` has them, in place of surfels.
     """
     name = device if isinstance(device, str) else None  # of the workers' device
     device, out = open_device(device), Path(out)
     out = out if out.is_dir() else writable_place(out)
-    sizes = sizes_of(memory_limit)
-    source = open_source(path, sizes.chunk)
-    options = Options(int(degree), error if error == "auto" else float(error), tolerance, _orient(source))
+    sizes = sizes_of(memory_limit) if sizes is None else sizes
+    source = path if isinstance(path, Source) else open_source(path, sizes.chunk)
+    options = Options(int(degree), error if error == "auto" else float(error), tolerance, _orient(source),
+                      None if patches is None else astuple(patches))
     build = begin(path, out, options, sizes, device)
     kept = device.keep(sizes.cell * KEPT_PER_POINT)
     steps = _Here(build, source) if scheduler is None else _cluster(scheduler, build, name)

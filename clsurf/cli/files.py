@@ -152,9 +152,9 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
           normals: NormalsOption = False, hit: HitOption = "", center: CenterOption = "",
           tolerance: Annotated[float, typer.Option(help="slim: world units; points that the surface does not come so "
                                                    "near get surfels of their own [off].")] = 0.0,
-          memory: Annotated[str, typer.Option(help="slim: stream a LAS, LAZ, PLY or text scan within this memory, such "
+          memory: Annotated[str, typer.Option(help="Stream a LAS, LAZ, PLY or text scan within this memory, such "
                                               "as 1GB; stopped builds go on with the same command.")] = "",
-          scheduler: Annotated[str, typer.Option(help="slim: stream the scan on the workers of a Dask scheduler, "
+          scheduler: Annotated[str, typer.Option(help="Stream the scan on the workers of a Dask scheduler, "
                                                  "tcp://host:8786 or local; they see the same files.")] = "",
           device: DeviceOption = "", quiet: QuietOption = False):
     """Turn a scan into a surface: SLIM surfels, spatial patches, surfels with normal maps, or a spherical scale map."""
@@ -165,7 +165,7 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
     how = with_scale_map(how, size, bits, layers, normals, hit, center)
     how = with_tolerance(how, tolerance)
     if memory or scheduler:
-        stream(scan, checked_stream(how, memory, scheduler, out), how, memory, scheduler, device or None, steps)
+        stream(scan, checked_stream(memory, out), how, memory, scheduler, device or None, steps)
         return
     checked_out(out, (".clsurf", ".slim2t") if how.kind in ("", "slim") else (".clsurf",))
     with steps.step("load"):

@@ -2,18 +2,15 @@
 
 from pathlib import Path
 
-from ..errors import InputError
 from .common import Steps, checked_out
 from .recipe import Recipe
 
 STAGES = {"read": "read", "plan": "plan", "check": "check coarse levels", "cells": "cells"}
 
 
-def checked_stream(how: Recipe, memory: str, scheduler: str, out: Path) -> Path:
-    """Return `out`, or raise InputError where a streamed build cannot have the recipe, the memory or the place."""
-    from ..build.slim import parse_bytes
-    if how.kind == "patches":
-        raise InputError(f"--{'memory' if memory else 'scheduler'}: an option of --kind slim, got --kind patches")
+def checked_stream(memory: str, out: Path) -> Path:
+    """Return `out`, or raise InputError where a streamed build cannot have the memory or the place."""
+    from ..sizes import parse_bytes
     parse_bytes(memory or None)
     if out.suffix.lower() != ".clsurf" or not out.is_dir():
         checked_out(out, (".clsurf",))
@@ -25,9 +22,11 @@ def stream(scan: Path, out: Path, how: Recipe, memory: str, scheduler: str, devi
     import clsurf
     try:
         with steps.step("build"):
-            surface = clsurf.build_slim(scan, **how.slim, memory_limit=memory or None, out=out, device=device,
-                                        scheduler=scheduler or None,
-                                        progress=lambda stage, done: steps.progress(STAGES.get(stage, stage), done))
+            build, options = (clsurf.build_patches, how.patches) if how.kind == "patches" else \
+                (clsurf.build_slim, how.slim)
+            surface = build(scan, **options, memory_limit=memory or None, out=out, device=device,
+                            scheduler=scheduler or None,
+                            progress=lambda stage, done: steps.progress(STAGES.get(stage, stage), done))
     except KeyboardInterrupt:
         part = out.with_name(out.name + ".part")
         if part.exists():

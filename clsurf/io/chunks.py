@@ -106,6 +106,27 @@ def open_source(path, chunk_points: int = 2_000_000) -> Source:
         raise FileFormatError(f"{path}: damaged or not a {ending} file: {one_line(error)}") from error
 
 
+class CloudSource(Source):
+    """Points in memory, for builds that a device holds only in parts.
+
+    Parameters
+    ----------
+    points, normals : (n, 3) float32
+    colors : (n, 4) uint8 or None
+    origin : (3,) float64
+    """
+
+    def __init__(self, points: NDArray, normals: NDArray, colors: NDArray | None, origin: NDArray, chunk_points: int):
+        super().__init__(Path("scan"), chunk_points)
+        self._arrays, self._origin, self.count = (points, colors, normals), origin, len(points)
+        self.chunks = -(-self.count // chunk_points)
+
+    def _read(self, number: int) -> Chunk:
+        rows = slice(number * self.chunk_points, (number + 1) * self.chunk_points)
+        points, colors, normals = (None if array is None else array[rows] for array in self._arrays)
+        return Chunk(points + self._origin, colors, normals)
+
+
 class _Las(Source):
     def __init__(self, path: Path, chunk_points: int):
         super().__init__(path, chunk_points)

@@ -8,6 +8,7 @@ from clsurf.surface.mesh import Mesh
 from clsurf.surface.slim import SlimSurface
 
 from . import scans
+from .stored import StoredSurface
 
 SURFACES = (".clsurf", ".slim2t")
 RANGES = (".conf", ".json")  # and folders of frames
@@ -69,6 +70,8 @@ def save(thing, path) -> None:
         An unknown ending, one that does not fit the kind of `thing`, or a place that cannot be written.
     """
     ending = _ending(path)
+    if isinstance(thing, StoredSurface):
+        thing = thing.load()
     if ending == ".clsurf":
         from .store import save_store
         save_store(thing, path)

@@ -19,11 +19,12 @@ from scipy.spatial import cKDTree
 from zarr.storage import LocalStore
 
 from clsurf.errors import FileFormatError
+from clsurf.surface.patch import PatchSurface
 from clsurf.surface.slim import SlimSurface
 
 from .layout import from_arrays, to_arrays
 
-KIND = "slim_parts"
+KINDS = {"slim_parts": "slim", "patches_parts": "patches"}  # and the kind of their parts
 SHARED = ("degree", "error", "diagonal", "bound", "bound_share", "oriented")
 CHUNK_BYTES = 1 << 20
 
@@ -52,14 +53,14 @@ def part_folder(folder: Path, number: int) -> Path:
     return folder / "parts" / f"{number:05d}"
 
 
-def write_index(folder: Path, values: dict, bounds: NDArray, surfels: NDArray) -> None:
-    """Write the root of a surface whose parts are there: after this the folder is a store."""
+def write_index(folder: Path, values: dict, bounds: NDArray, surfels: NDArray, kind: str = "slim") -> None:
+    """Write the root of a surface whose parts are there, all of `kind`: after this the folder is a store."""
     from .store import VERSION, create_array
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         zarr.create_group(LocalStore(folder / "parts"), attributes={})
         group = zarr.create_group(LocalStore(folder), attributes={
-            "format": "clsurf", "version": VERSION, "kind": KIND, "values": values})
+            "format": "clsurf", "version": VERSION, "kind": f"{kind}_parts", "values": values})
         create_array(group, "bounds", np.asarray(bounds, np.float64), CHUNK_BYTES, "lz4")
         create_array(group, "surfels", np.asarray(surfels, np.int64), CHUNK_BYTES, "lz4")
 
@@ -122,15 +123,28 @@ def _adopted(centers, radii, level, leaf, child) -> list[tuple[NDArray, NDArray]
     return out
 
 
-def read_parts(path: Path, group: zarr.Group, members) -> SlimSurface:
+def joined_patches(parts: list[PatchSurface], shared: dict) -> PatchSurface:
+    """Return the patches of all parts as one surface."""
+    whole = [part for part in parts if len(part)] or parts[:1]
+    gather = lambda name: np.concatenate([getattr(part, name) for part in whole])  # noqa: E731
+    origin = parts[0].origin
+    bound = shared.get("bound")
+    return PatchSurface(np.concatenate([part.origins + (part.origin - origin) for part in whole]), gather("axis_x"),
+                        gather("axis_y"), gather("axis_z_length"), gather("size"), gather("displacements"),
+                        None if whole[0].colors is None else gather("colors"), origin=origin,
+                        diagonal=float(shared["diagonal"]), bound=float("nan") if bound is None else bound,
+                        bound_share=float(shared["bound_share"]), oriented=all(part.oriented for part in whole))
+
+
+def read_parts(path: Path, group: zarr.Group, members) -> SlimSurface | PatchSurface:
     """Return the surface of a store in parts, whole."""
     from .store import read_arrays
-    values = dict(group.attrs["values"])
+    values, kind = dict(group.attrs["values"]), KINDS[group.attrs["kind"]]
     parts = []
     for number in range(int(values["parts"])):
         name = f"parts/{number:05d}"
         if f"{name}/zarr.json" not in members.sizes:
             raise FileFormatError(f"{path}: part {number} of {values['parts']} is missing: truncated or damaged")
         part = group[name]
-        parts.append(from_arrays("slim", read_arrays(path, part, members, name + "/"), dict(part.attrs["values"])))
-    return joined(parts, values)
+        parts.append(from_arrays(kind, read_arrays(path, part, members, name + "/"), dict(part.attrs["values"])))
+    return joined(parts, values) if kind == "slim" else joined_patches(parts, values)

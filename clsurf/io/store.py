@@ -106,7 +106,7 @@ def _read_group(path: Path, group: zarr.Group, members: "_Members"):
     if version > VERSION:
         raise FileFormatError(f"{path}: written in version {version} of the .clsurf format, this clsurf reads up to "
                               f"version {VERSION}: install a newer clsurf")
-    if kind == parts.KIND:
+    if kind in parts.KINDS:
         return parts.read_parts(path, group, members)
     if kind not in KINDS:
         raise FileFormatError(f"{path}: holds the unknown kind {kind!r}: expected {', '.join(KINDS)}")

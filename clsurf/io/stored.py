@@ -52,7 +52,7 @@ class StoredSurface:
                 self._group = zarr.open_group(_store(self.place), mode="r", zarr_format=3)
                 about = dict(self._group.attrs)
                 self._single = about.get("kind") == "slim"
-                if about.get("format") != "clsurf" or about.get("kind") not in (parts.KIND, "slim"):
+                if about.get("format") != "clsurf" or about.get("kind") not in ("slim_parts", "slim"):
                     raise FileFormatError(f"{place}: expected a SLIM surface in a .clsurf store, got "
                                           f"{about.get('kind')!r}")
                 self._values = dict(about["values"])

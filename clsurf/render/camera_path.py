@@ -206,24 +206,30 @@ def _rings(points, reach, target, axis) -> NDArray:
         return rings[[rings[:, 0].argmax(), rings[:, 1].argmin(), rings[:, 1].argmax()]]
 
 
-def render_frames(scene, cameras: Iterable[Camera], size: tuple[int, int] = (1024, 768), device=None,
+def render_frames(scene, cameras: Iterable[Camera], size: tuple[int, int] = (1024, 768), device=None, scheduler=None,
                   **options) -> Iterator:
     """Yield a `Frame` per camera, drawn when it is asked for.
 
     Parameters
     ----------
     scene
-        As of `render`.
+        As of `render`; with `scheduler` the path of a surface's file, which all workers see.
     cameras : iterable of Camera
         Such as `turntable` or `CameraPath.frames`.
     size, device, options
         As of `render`.
+    scheduler : str or distributed.Client, optional
+        A Dask scheduler whose workers draw: "tcp://host:8786", or "local" for processes of this machine.
 
     Yields
     ------
     Frame
         See `write_video`, which takes them one by one.
     """
+    if scheduler is not None:
+        from .remote import remote_frames
+        yield from remote_frames(scene, cameras, size, device, scheduler, options)
+        return
     from .renderer import Renderer
     from .scene import as_scene
     scene = as_scene(scene)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..device import Device, Profile, open_device
-from ..errors import DeviceError, InputError
+from ..errors import DeviceError, DeviceMemoryError, InputError
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -18,6 +18,7 @@ from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .average import average, fine_channels
 from .backdrop import checked_background, lay_over
+from .bands import draw_in_bands
 from .camera import Camera
 from .clip import checked_clip, view_clip
 from .coverage import FACTOR, checked_antialias, cover_edges, edge_channels, edge_layout, mark_edges
@@ -33,6 +34,7 @@ from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
 from .point_drawing import PointDrawing
 from .points import draw_points, is_unlit, upload_cloud
+from .resident import checked_budget, resident_scene
 from .scale_map import draw_scale_map, upload_scale_map
 from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene
@@ -68,14 +70,22 @@ class Renderer:
         Pixels across a tile, a multiple of 8; by default 32 (8 for work-groups).
     profile : bool
         Time every launch; see the attribute `profile`.
+    budget : int or str
+        Bytes that each `StoredSurface` may take in memory, such as "2GB".
+    wait : bool
+        Draw a `StoredSurface` when all that the view needs of it has been read. Otherwise a frame shows what is there,
+        and `complete` says whether that is all; later frames show more.
 
     Attributes
     ----------
+    complete : bool
+        Whether the last frame shows all that it should of the stored surfaces in it, within the budget.
     profile : Profile or None
         Print it for a table of kernels and times.
     """
 
-    def __init__(self, device=None, lanes: int | None = None, tile: int | None = None, profile: bool = False):
+    def __init__(self, device=None, lanes: int | None = None, tile: int | None = None, profile: bool = False,
+                 budget: int | str = "2GB", wait: bool = False):
         self.device: Device = open_device(device)
         lanes = self.device.lanes if lanes is None else lanes
         if lanes not in (16, 8, 4, 1):
@@ -88,6 +98,8 @@ class Renderer:
         self.profile = Profile() if profile else None
         self._scratch: Scratch | None = Scratch(self.device, lanes)
         self._uploads = weakref.WeakKeyDictionary()
+        self._residents = weakref.WeakKeyDictionary()
+        self.budget, self.wait, self.complete = checked_budget(budget), wait, True
 
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
                channels=("color", "depth", "normal"), shading: Shading | None = None, lod: float = 4.0,
@@ -154,7 +166,7 @@ class Renderer:
         InputError
             An option that cannot be used.
         DeviceError
-            The renderer is closed, or the device lacks memory.
+            The renderer is closed, or the device lacks memory even for a band of the picture.
         """
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
@@ -193,19 +205,21 @@ class Renderer:
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
+        scene, self.complete = resident_scene(scene, self._residents, camera, size, lod, self.budget, self.wait)
         check_differentials(scene.placed, curved, shading.look, slim)
-        own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
-        try:
+
+        def draw(scene, camera, picture):
+            size, drawn = tuple(n * factor for n in picture), channels
             # The stages of a frame.
             placed, origin = scene.placed, scene_origin(scene)
-            early = wants_lighting(scene, shading, channels)
-            mirrored, lighting = wants_mirror(scene, shading, channels), None
+            early = wants_lighting(scene, shading, drawn)
+            mirrored, lighting = wants_mirror(scene, shading, drawn), None
             if early or covered or mirrored:
                 lighting = prepared_lighting(self.device, scene, shading, camera)
             if lighting and len(lighting.materials) > 1:
-                channels = list(dict.fromkeys([*channels, "id"]))
+                drawn = list(dict.fromkeys([*drawn, "id"]))
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not early
-            grid = self._new_grid(placed, size, channels, curved, shading, patches, points, view_clip(clip, camera),
+            grid = self._new_grid(placed, size, drawn, curved, shading, patches, points, view_clip(clip, camera),
                                   early, at_once, lighting)
             floats = shading_floats(shading, scene.lights, back.color, camera)
             whole = view_floats(camera, size, offset=camera.eye - origin)
@@ -214,11 +228,11 @@ class Renderer:
             if at_once:
                 (surface, matrix), = placed
                 arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
-                                       whole, floats, channels)
+                                       whole, floats, drawn)
             else:
                 self._draw(grid, scene, camera, look, floats, lighting if early else None, factor)
                 arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), look.lamps,
-                               "phong" if early else shading.look, channels)
+                               "phong" if early else shading.look, drawn)
             if covered:
                 edges, large = mark_edges(self.device, self._scratch, grid, self.device.upload(whole), arrays,
                                           edge_layout(grid.layout, len(lighting.materials)))
@@ -233,6 +247,18 @@ class Renderer:
             arrays = self.device.download_all(arrays)
             arrays |= split_differentials(arrays.pop(NAME), curved) if curved else {}
             return Frame({name: arrays[name] for name in asked}, origin, camera)
+
+        cull = not shading.shadows and not shading.occlusion and not wants_mirror(scene, shading, channels)
+        own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
+        try:
+            try:
+                return draw(scene, camera, picture)
+            except DeviceMemoryError as error:
+                failed = error
+            if not scene.surfaces:
+                raise failed
+            self._give_back()
+            return draw_in_bands(draw, scene, camera, picture, cull)
         finally:
             self.device.profile = own_profile
 
@@ -285,12 +311,19 @@ class Renderer:
             upload = self._uploads[surface] = KINDS[type(surface)][0](self.device, surface)
         return upload
 
+    def _give_back(self) -> None:
+        """Give back what is kept between frames."""
+        self._scratch.clear()
+        self._uploads.clear()
+        self.device.trim()
+
     def close(self) -> None:
         """Give all device memory back; the renderer cannot be used afterwards. May be called twice."""
         if self._scratch is not None:
             self._scratch.clear()
             self._scratch = None
             self._uploads.clear()
+            self._residents.clear()
 
     def __repr__(self):
         state = "closed" if self._scratch is None else f"tiles of {BIN * self.tile_bins} pixels"
@@ -371,5 +404,5 @@ def shared_renderer(device=None, tile: int | None = None) -> Renderer:
     kept = _shared.__dict__.setdefault("renderers", {})
     key = (id(opened), tile)
     if key not in kept:
-        kept[key] = Renderer(opened, tile=tile)
+        kept[key] = Renderer(opened, tile=tile, wait=True)
     return kept[key]

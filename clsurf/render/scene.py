@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..io.stored import StoredSurface
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -17,7 +18,7 @@ from ..surface.surfel import SurfelHierarchy
 from .light import Light
 from .material import Material, checked_materials
 
-DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, PointCloud, RangeScan)
+DRAWABLE = (SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, PointCloud, RangeScan, StoredSurface)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

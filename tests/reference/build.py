@@ -95,17 +95,40 @@ def choose_centers(points, open_, cells, spacing):
     return np.sort(chosen)
 
 
-def cover_points(points, normals, center, record, cosine=0.2):
+def off_surfel(points, place, surfel, count):
+    """Distances of points from a surfel's graph along its normal; `count` coefficients."""
+    u, v = frame_of_normals(surfel[1:4])
+    d = points - place
+    return d @ surfel[1:4] - height(surfel[6:6 + count], d @ u, d @ v)
+
+
+def cover_points(points, normals, center, record, cosine=0.2, tolerance=np.inf):
     """Overlap of the leaves and points held by internal surfels."""
+    overlap, held = cover_leaves(points, normals, points[center], record, cosine, tolerance)
+    np.add.at(overlap, center, record[:, 5] > 0)
+    return overlap, held
+
+
+def cover_leaves(points, normals, place, record, cosine=0.2, tolerance=np.inf):
+    """The same of leaves at places (m, 3), which need not be points."""
     overlap, held = np.zeros(len(points)), np.zeros(len(points), bool)
-    for c, surfel in zip(center, record.astype(float), strict=True):
-        d2 = ((points - points[c]) ** 2).sum(axis=1)
+    for at, surfel in zip(place, record.astype(float), strict=True):
+        d2 = ((points - at) ** 2).sum(axis=1)
         if surfel[5]:
-            overlap += np.where(normals @ surfel[1:4] >= cosine, weight(d2, ALPHA * surfel[0]), 0)
-            overlap[c] += 1
+            near = (normals @ surfel[1:4] >= cosine) & (np.abs(off_surfel(points, at, surfel, 6)) <= tolerance)
+            overlap += np.where(near, weight(d2, ALPHA * surfel[0]), 0)
         else:
             held |= d2 < surfel[0] ** 2
     return overlap, held
+
+
+def check_leaves(points, own, place, record):
+    """Sums of G and G f^2 over the own points of leaves' balls, (m, 2)."""
+    out = []
+    for at, surfel in zip(place, record.astype(float), strict=True):
+        g = own * weight(((points - at) ** 2).sum(axis=1), surfel[0])
+        out.append((g.sum(), (g * off_surfel(points, at, surfel, 6) ** 2).sum()))
+    return np.array(out)
 
 
 def neighbor_spread(points, query, neighbors=10):
