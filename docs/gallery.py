@@ -46,7 +46,7 @@ def points(size):
 
 
 def cut(size):
-    """A clip plane through the middle shows the inside."""
+    """A clip plane takes the front half away; what is seen are the inner sides of the back."""
     slim = clsurf.build_slim(clsurf.models.demo_scan(60_000), error=0.003)
     camera = clsurf.Camera.framing(slim, direction=(0.3, 0.9, 2), aspect=4 / 3)
     frame = clsurf.render(slim, camera, size=size, clip=(0, 0, -1, 0), antialias="coverage")
@@ -62,11 +62,11 @@ def balls(size):
 
 
 def curvature(size):
-    """Mean curvature at every pixel of a torus, with its scale."""
+    """Gaussian curvature at every pixel of a torus, with its scale: positive outside, negative in the hole."""
     slim = clsurf.build_slim(clsurf.models.torus(20_000), degree=3, error=0.003)
-    camera = clsurf.Camera.framing(slim, direction=(0.5, -1, 1.2), up=(0, 0, 1), aspect=4 / 3)
-    frame = clsurf.render(slim, camera, size=size, channels=("color", "normal", "mean"))
-    frame = clsurf.color_map(frame, "mean", legend=size[0] > 200)
+    camera = clsurf.Camera.framing(slim, direction=(0.5, -1, 1.2), up=(0, 0, 1), aspect=4 / 3, margin=1.4)
+    frame = clsurf.render(slim, camera, size=size, channels=("color", "normal", "gaussian"))
+    frame = clsurf.color_map(frame, "gaussian", legend=size[0] > 200)
     return frame
 
 
