@@ -70,6 +70,9 @@ def surfaces(device, size: Size) -> dict:
     made = {f"slim{degree}": clsurf.build_slim(given["mesh"], degree=degree, error=0.02, device=device)
             for degree in (1, 2, 3)}
     made["patches"] = clsurf.build_patches(given["mesh"], patches=max(12, size.points // 200), nodes=9, device=device)
+    made["surfels"] = clsurf.build_surfels(given["mesh"], map_size=4, device=device)
+    made["hybrid"] = clsurf.build_surfels(given["mesh"], map_size=4, hybrid=True, device=device)
+    made["scale_map"] = clsurf.build_scale_map(given["mesh"], size=16, normals=True, device=device)
     return made
 
 
@@ -170,6 +173,63 @@ def draw_patches(device, size, made):
 
 
 @job
+def build_surfels(device, size, made):
+    """Surfel hierarchies of points and of triangles, with their normal maps."""
+    given, out = scans(size), {}
+    for name, scan, hybrid in (("pure", given["cloud"], False), ("hybrid", given["mesh"], True)):
+        built = clsurf.build_surfels(scan, map_size=4, hybrid=hybrid, device=device)
+        out |= {f"{name}_atlas": built.normal_atlas, f"{name}_positions": built.positions}
+    return out
+
+
+@job
+def build_scale_map(device, size, made):
+    """Scale maps drawn from a mesh and traced from a surface, and what lies between two."""
+    mesh = clsurf.build_scale_map(scans(size)["mesh"], size=16, layers=2, bits=16, device=device)
+    traced = clsurf.build_scale_map(made["slim2"], size=8, device=device)
+    return {"mesh": mesh.scales, "valid": mesh.valid, "traced": traced.scales,
+            "morphed": clsurf.morph(mesh, made["scale_map"], 0.5, device=device).scales}
+
+
+@job
+def draw_others(device, size, made):
+    """Pictures of surfels, scale maps, meshes and clouds in both kernel forms, cut open, and with covered edges."""
+    given, out = scans(size), {}
+    things = {name: made[name] for name in ("surfels", "hybrid", "scale_map")}
+    things |= {"mesh": given["mesh"], "cloud": given["cloud"], "bare": clsurf.PointCloud(given["cloud"].points)}
+    channels = ("color", "depth", "normal", "position", "id", "count", "level", "cost")
+    for lanes in (16, 1):
+        with clsurf.Renderer(device, lanes=lanes) as renderer:
+            for name, thing in things.items():
+                frame = renderer.render(thing, camera(size), size.picture, channels)
+                out |= {f"{channel}_{name}_{lanes}": array for channel, array in frame.channels.items()}
+                cut = renderer.render(thing, camera(size), size.picture, ("depth",), clip=(1, 0, 0, 0))
+                out[f"depth_cut_{name}_{lanes}"] = cut.depth
+            sphere = clsurf.ScaleMapDrawing("geosphere", 3, "neighbours")
+            out[f"depth_geosphere_{lanes}"] = renderer.render(made["scale_map"], camera(size), size.picture,
+                                                              scale_map=sphere).depth
+            out[f"covered_{lanes}"] = renderer.render(list(things.values()), camera(size), size.picture, ("color",),
+                                                      antialias="coverage").color
+    return out
+
+
+@job
+def materials(device, size, made):
+    """Materials, image light and backgrounds."""
+    lamps = (clsurf.Light("image", picture="sky"), clsurf.Light("spot", (1.0, -1.0, 3.0), direction=(-1, 1, -3)))
+    looks = [clsurf.Material("physical", metallic=1.0, roughness=0.3), clsurf.Material("matcap"),
+             clsurf.Material("normal"), clsurf.Material("phong", mirror=0.5)]
+    names, out = ("slim2", "patches", "surfels", "scale_map"), {}
+    scene = clsurf.Scene([made[name].moved(raised(0.6 * i)) for i, name in enumerate(names)], lights=lamps,
+                         materials=looks)
+    for lanes in (16, 1):
+        with clsurf.Renderer(device, lanes=lanes) as renderer:
+            out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.picture, ("color",), background="sky",
+                                                    shading=clsurf.Shading(occlusion=32)).color
+    return out
+
+
+@job
 def light(device, size, made):
     """Shadows, ambient occlusion and a mirror, in both kernel forms."""
     lamps = (clsurf.Light("directional", (1, 1, 2)), clsurf.Light("point", (2.0, -2.0, 3.0)))
@@ -214,9 +274,10 @@ def trace(device, size, made):
 def project(device, size, made):
     """The nearest places on a surface, and distances between scans and surfaces."""
     points = clsurf.models.sphere(size.rays, radius=1.2).points.astype(np.float64)
-    found = {degree: clsurf.project(made[f"slim{degree}"], points, device=device) for degree in (1, 2, 3)}
+    names = ("slim1", "slim2", "slim3", "surfels", "scale_map")
+    found = {name: clsurf.project(made[name], points, device=device).position for name in names}
     error = clsurf.error(made["patches"], scans(size)["mesh"], device=device)
-    return {f"position{degree}": value.position for degree, value in found.items()} | {"error": np.array([error.rms])}
+    return {f"position_{name}": value for name, value in found.items()} | {"error": np.array([error.rms])}
 
 
 @job

@@ -99,7 +99,7 @@ def test_over_the_web(stored, whole, device):
     handler.log_message = lambda *_: None
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        remote = clsurf.open(f"http://127.0.0.1:{server.server_address[1]}")
+        remote = clsurf.open_surface(f"http://127.0.0.1:{server.server_address[1]}")
         frame = clsurf.render(remote, camera(), SIZE, device=device)
         assert len(remote) == len(whole)
         server.shutdown()
@@ -108,10 +108,10 @@ def test_over_the_web(stored, whole, device):
 
 def test_opens_a_plain_store(whole, tmp_path):
     clsurf.save(whole, tmp_path / "zip.clsurf")
-    opened = clsurf.open(tmp_path / "zip.clsurf")
+    opened = clsurf.open_surface(tmp_path / "zip.clsurf")
     assert len(opened) == len(whole) and np.allclose(opened.bounds, whole.bounds)
     with pytest.raises(InputError, match="no such"):
-        clsurf.open(tmp_path / "none.clsurf")
+        clsurf.open_surface(tmp_path / "none.clsurf")
 
 
 ALL = ("color", "depth", "normal", "id", "count", "mean")

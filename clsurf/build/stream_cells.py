@@ -33,6 +33,7 @@ ALPHA = 2 / 3  # cover.clh
 # or what condition (4) lets pass as noise and penalty.
 WORSE, ALLOWED_PENALTY, ALLOWED_NOISE = 2.0, 4.0, 3.0
 ERROR_SHARE = 0.5  # of the tolerance: WITHIN_ERROR of fit_surfels.cl
+OVERLAP = 1.5  # node spacings (or twice the points' where none is given) that patches go over a cell's border
 ORIENTED = 200_000  # points of the copy that are oriented together
 DISTANCES = 64  # every so many of the points is measured for `bound`
 
@@ -213,9 +214,10 @@ def build_cell(points: CellPoints, plan: Plan, options: Options, coarse: Coarse,
     if options.patches is not None:
         from .patches import PatchRequest
         from .stream_patches import build_patch_cell
-        own = points.own
+        request = PatchRequest(*options.patches)
+        own = with_rim(points, OVERLAP * max(request.spacing or 0.0, 2 * plan.noise.spacing * plan.diagonal), device)
         return build_patch_cell(points.position[own], normals[own], None if points.colors is None else
-                                points.colors[own], points.origin, plan, PatchRequest(*options.patches), total, device)
+                                points.colors[own], points.origin, plan, request, total, device)
     tree = build_point_tree(points.position, normals, np.zeros(3, np.float32), 1 / plan.diagonal, device)
     tolerance = tolerance_of(plan, options)
     near = points.near(coarse.surface)
@@ -228,6 +230,17 @@ def build_cell(points: CellPoints, plan: Plan, options: Options, coarse: Coarse,
     usable = Points(points.position, normals, points.colors, None)
     surface = assemble(levels, usable, tree, options.degree, plan.error, plan.diagonal, points.origin)
     return surface, own_distances(tree, points, surface, coarse.surface, near)
+
+
+def with_rim(points: CellPoints, reach: float, device: Device) -> NDArray:
+    """Return which points (n,) bool are the cell's own or at most `reach` away from those."""
+    halo = np.flatnonzero(~points.own)
+    if not len(halo) or len(halo) == len(points.own):
+        return points.own
+    out = points.own.copy()
+    _, distance = nearest(points.position[points.own], 1, points.position[halo], device)
+    out[halo] = distance[:, 0] <= reach
+    return out
 
 
 def covered_by(tree: PointTree, place: NDArray, record: NDArray, tolerance: float, degree: int) -> DeviceArray:
