@@ -25,8 +25,8 @@ GROUPS = (
 
 HEAD = """# API reference
 
-Every public name of clsurf, from its docstring: `python docs/api.py` writes this page. World units are those of the scan;
-a device is what `open_device` takes.
+Every public name of clsurf, from its docstring: `python docs/api.py` writes this page. World units are those of the
+scan; a device is what `open_device` takes.
 """
 
 

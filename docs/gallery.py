@@ -192,15 +192,21 @@ def matcap(size):
 
 
 def smooth(size):
-    """A rock with noise of 0.4 % of its size, and the same after `clsurf.smooth`."""
-    rock = clsurf.models.meteoroid(seed=4, faces=40_000)
-    noise = np.random.default_rng(0).normal(0, 0.008, rock.vertices.shape).astype(np.float32)
-    noisy = clsurf.Mesh(rock.vertices + noise, rock.faces)
-    right = np.eye(4)
-    right[0, 3] = 2.4
+    """A torus with noise of 1 % of its radius, and the same after `clsurf.smooth`."""
+    u, v = np.meshgrid(np.arange(160), np.arange(80), indexing="ij")
+    ring = 1 + 0.4 * np.cos(2 * np.pi * v / 80)
+    torus = np.stack([ring * np.cos(2 * np.pi * u / 160), ring * np.sin(2 * np.pi * u / 160),
+                      0.4 * np.sin(2 * np.pi * v / 80)], axis=-1).reshape(-1, 3)
+    near, far = u * 80 + v, (u + 1) % 160 * 80 + v
+    next_near, next_far = u * 80 + (v + 1) % 80, (u + 1) % 160 * 80 + (v + 1) % 80
+    faces = np.concatenate([np.stack(corners, axis=-1).reshape(-1, 3)
+                            for corners in ((near, far, next_far), (near, next_far, next_near))])
+    noisy = clsurf.Mesh(torus + np.random.default_rng(0).normal(0, 0.01, torus.shape), faces)
     clean = clsurf.smooth(noisy)
-    both = [clsurf.Mesh(noisy.vertices, noisy.faces), clsurf.Mesh(clean.vertices + right[:3, 3], clean.faces)]
-    camera = clsurf.Camera.framing(clsurf.Scene(both), direction=(0, 0.3, 2), aspect=4 / 3)
+    right = np.eye(4)
+    right[0, 3] = 3.0
+    both = [noisy, clean.moved(right)]
+    camera = clsurf.Camera.framing(clsurf.Scene(both), direction=(0, -1, 1.5), up=(0, 0, 1), aspect=4 / 3)
     frame = clsurf.render(both, camera, size=size, supersampling=2)
     return frame
 

@@ -10,6 +10,7 @@ from reference.surfaces import sphere
 import clsurf
 from clsurf.cli import main
 from clsurf.io.images import read_image
+from clsurf.surface.srgb import to_linear
 
 
 @pytest.fixture
@@ -52,6 +53,16 @@ def test_a_moving_picture(ball, options, capsys):
     assert len(frames) == 3 and frames[0].shape == (32, 48, 3)
     assert all(20 < middle(frame) < 28 for frame in frames) if "path.json" not in options else \
         abs(middle(frames[1]) - 24) < 1
+
+
+def test_a_moving_picture_is_exposed(ball):
+    """A stop less is half the light: sRGB 0.5 of linear 0.21."""
+    assert main(["render", ball, "full", "--size", "24x16", "--turntable", "2", "--quiet"]) == 0
+    assert main(["render", ball, "half", "--size", "24x16", "--turntable", "2", "--exposure", "-1", "--quiet"]) == 0
+    full, half = (to_linear(read_image(f"{name}/00001.png")[..., :3].astype(float) / 255) for name in ("full", "half"))
+    at = full[8, 12]
+    assert (at > 0.2).all() and half[8, 12] == pytest.approx(at / 2, abs=0.01)
+    assert main(["render", ball, "sixteen", "--size", "24x16", "--turntable", "2", "--bits", "16", "--quiet"]) == 2
 
 
 def test_a_path_has_a_second_from_key_to_key(ball):

@@ -32,10 +32,14 @@ class Output:
         """Write a frame."""
         frame.save(path, self.tone, self.exposure, self.bits)
 
+    def shown(self, frame):
+        """Return a frame of a moving picture as `write_video` is to have it."""
+        return frame if self.tone == "none" and not self.exposure else frame.pixels(self.tone, self.exposure)
+
 
 def output(path: Path, background: str, antialias: str, supersampling: int, tone: str, exposure: float, bits: int,
-           lines: str, channel: str) -> Output:
-    """Return the options of what is written, or raise InputError."""
+           lines: str, channel: str, moves: bool = False) -> Output:
+    """Return the options of what is written, a moving picture where it `moves`, or raise InputError."""
     from ..io.images import checked_output
     from ..render.coverage import checked_antialias
     checked_antialias(antialias, supersampling)
@@ -43,8 +47,10 @@ def output(path: Path, background: str, antialias: str, supersampling: int, tone
     if (lines or channel) and not plain:
         raise InputError("--background, --antialias, --tone, --exposure, --bits: expected no --lines and no --channel "
                          "beside them")
+    if moves and bits != 8:
+        raise InputError(f"bits: expected 8 for a moving picture, got {bits}")
     if not (lines or channel):
-        checked_output(path, tone, exposure, bits)
+        checked_output("frame.png" if moves else path, tone, exposure, bits)
     return Output(parsed_background(background), antialias, tone, exposure, bits)
 
 

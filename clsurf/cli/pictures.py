@@ -147,7 +147,7 @@ def render(source: SourceArgument,
     lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
-    written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel)
+    written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel, moving.moves)
     if written.background == "sky" and not sky:
         raise InputError("--background sky: expected --sky beside it")
     as_it_is, points = wants_scan(drawn_as, lines, channel, kind), point_drawing(point_size, eye_dome, attribute)
@@ -172,7 +172,7 @@ def render(source: SourceArgument,
 
     chosen.profile = Profile() if profile else None
     if moving.moves:
-        moving.write(out, drawn, thing, view, picture_size, steps)
+        moving.write(out, lambda seen: written.shown(drawn(seen)), thing, view, picture_size, steps)
     else:
         seen = moving.camera or view.camera(thing, picture_size)
         with steps.step("draw"):
