@@ -52,8 +52,9 @@ KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, d
          Mesh: (upload_mesh, draw_mesh), PointCloud: (upload_cloud, draw_points),
          RangeScan: (upload_cloud, draw_points)}
 # Made and checked once: 14 us.
-DEFAULT_SHADING, DEFAULT_PATCHES, DEFAULT_SLIM, DEFAULT_SURFELS, DEFAULT_SCALE_MAP, DEFAULT_POINTS = (
-    Shading(), PatchDrawing(), SlimDrawing(), SurfelDrawing(), ScaleMapDrawing(), PointDrawing())
+DEFAULT_SHADING = Shading()
+DEFAULT_DRAWINGS = {"patches": PatchDrawing(), "slim": SlimDrawing(), "surfels": SurfelDrawing(),
+                    "scale_map": ScaleMapDrawing(), "points": PointDrawing()}
 LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
@@ -187,21 +188,10 @@ class Renderer:
         back = checked_background(background, scene)
         if wants_mirror(scene, shading, channels):
             channels = list(dict.fromkeys([*channels, *MIRROR_CHANNELS]))
-        patches = DEFAULT_PATCHES if patches is None else patches
-        if not isinstance(patches, PatchDrawing):
-            raise InputError(f"patches: expected a clsurf.PatchDrawing, got {patches!r}")
-        slim = DEFAULT_SLIM if slim is None else slim
-        if not isinstance(slim, SlimDrawing):
-            raise InputError(f"slim: expected a clsurf.SlimDrawing, got {slim!r}")
-        surfels = DEFAULT_SURFELS if surfels is None else surfels
-        if not isinstance(surfels, SurfelDrawing):
-            raise InputError(f"surfels: expected a clsurf.SurfelDrawing, got {surfels!r}")
-        scale_map = DEFAULT_SCALE_MAP if scale_map is None else scale_map
-        if not isinstance(scale_map, ScaleMapDrawing):
-            raise InputError(f"scale_map: expected a clsurf.ScaleMapDrawing, got {scale_map!r}")
-        points = DEFAULT_POINTS if points is None else points
-        if not isinstance(points, PointDrawing):
-            raise InputError(f"points: expected a clsurf.PointDrawing, got {points!r}")
+        patches, slim, surfels, scale_map, points = (
+            checked_drawing(name, given) for name, given in (
+                ("patches", patches), ("slim", slim), ("surfels", surfels), ("scale_map", scale_map),
+                ("points", points)))
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
@@ -371,6 +361,15 @@ def checked_channels(channels) -> tuple[str, ...]:
         got = ", ".join(map(str, channels)) or "none"
         raise InputError(f"channels: expected some of {', '.join((*CHANNELS, *DIFFERENTIALS))}, got {got}")
     return channels
+
+
+def checked_drawing(name: str, given):
+    """Return how a kind is drawn, the default where nothing is given, or raise InputError."""
+    drawing = DEFAULT_DRAWINGS[name] if given is None else given
+    kind = type(DEFAULT_DRAWINGS[name])
+    if not isinstance(drawing, kind):
+        raise InputError(f"{name}: expected a clsurf.{kind.__name__}, got {drawing!r}")
+    return drawing
 
 
 def checked_lod(lod) -> float:
