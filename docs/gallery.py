@@ -89,8 +89,8 @@ def lines(size):
 
 
 def earth(size):
-    """Spatial patches: a made-up Earth of 1128 patches of 17 x 17 nodes, 4 bytes a node."""
-    patches = clsurf.models.earth(1128)
+    """Spatial patches: a made-up Earth of 383 patches of 17 x 17 nodes, 4 bytes a node."""
+    patches = clsurf.models.earth(383)
     camera = clsurf.Camera.framing(patches, direction=(-1, 0.5, 1), aspect=4 / 3)
     sun = clsurf.Light("directional", (-1.2, 0.8, 0.4), (1.6, 1.55, 1.5))
     frame = clsurf.render(clsurf.Scene([patches], lights=[sun]), camera, size=size, antialias="coverage")
