@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import clsurf
+from bench.answers import torus_mesh
 
 CLASSES = [thing for name in clsurf.__all__ if inspect.isclass(thing := getattr(clsurf, name))]
 FUNCTIONS = [thing for name in clsurf.__all__ if inspect.isfunction(thing := getattr(clsurf, name))]
@@ -84,6 +85,28 @@ def test_readmes_measures_run_as_written(slim, tmp_path, monkeypatch, device):
     assert names["bends"].mean.shape == (4000,) and names["hits"].hit.sum() > 100_000
     assert "<svg" in Path("inked.svg").read_text(encoding="utf-8")
     assert all(Path(name).stat().st_size > 1000 for name in ("mean.png", "inked.png", "inked.svg"))
+
+
+def test_readmes_scenes_run_as_written(slim, tmp_path, monkeypatch, device):
+    """README's fourth block: all kinds, materials and light in one picture."""
+    monkeypatch.chdir(tmp_path)
+    shown = []
+    monkeypatch.setattr(clsurf, "view", shown.append)
+    mesh = torus_mesh(40, 20)
+    code = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[3]
+    names = {"clsurf": clsurf, "slim": slim, "scan": mesh, "mesh": mesh, "matrix": np.eye(4),
+             "cloud": clsurf.models.sphere(2000), "other": clsurf.build_scale_map(mesh, size=32)}
+    exec(code, names)
+    assert Path("scene.png").stat().st_size > 5_000 and shown == [names["scene"]]
+
+
+def test_readmes_survey_is_streamed_as_written(tmp_path, monkeypatch, device):
+    """README's fifth block, with a generated survey."""
+    monkeypatch.chdir(tmp_path)
+    clsurf.save(clsurf.models.torus(20_000, 100.0, 40.0), "survey.laz")
+    names = {"clsurf": clsurf}
+    exec(re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)[4], names)
+    assert isinstance(names["survey"], clsurf.StoredSurface) and len(names["survey"]) > 100
 
 
 def test_readmes_commands_exist(capsys):

@@ -53,7 +53,7 @@ def build_patches(scan, nodes=17, patches=None, spacing=None, error=None, views=
     progress : callable, optional
         Called as progress(stage, done) with done from 0 to 1; returning False stops the build.
     device : str, Device, ..., optional
-    memory_limit, out, scheduler
+    memory_limit, out, scheduler : optional
         As of `build_slim`: a LAS, LAZ, COPC, PLY (without faces) or text scan is streamed to the .clsurf `out`, cell by
         cell, within the memory; patches end where cells do. What is returned is read from there.
 

@@ -134,5 +134,20 @@ def _store(place: str):
 
 
 def open_surface(place) -> StoredSurface:
-    """Open a SLIM surface in a .clsurf store without reading it whole; see `StoredSurface`."""
+    """Open a SLIM surface in a .clsurf store without reading it whole; see `StoredSurface`.
+
+    Parameters
+    ----------
+    place : path-like or str
+        A folder, a zip file, or an address that fsspec reads, such as https://host/survey.clsurf (extra ``scale``).
+
+    Returns
+    -------
+    StoredSurface
+
+    Raises
+    ------
+    InputError, FileFormatError
+        Nothing there, or something else than the store of a SLIM surface.
+    """
     return StoredSurface(place)

@@ -155,10 +155,14 @@ def turntable(thing, count: int = 120, direction=(1, 0.5, 2), fov: float = 40.0,
         A scan, a surface, a placed surface or a scene; or a (2, 3) box.
     count : int
         Number of cameras; the first is not repeated at the end.
-    direction, fov, up, aspect, margin
+    direction, fov, up, aspect, margin : optional
         As of `Camera.framing`, for the first camera; the turn is about `up`.
     turns : float
         Negative: the other way round.
+
+    Returns
+    -------
+    list of Camera
 
     Raises
     ------
@@ -212,19 +216,24 @@ def render_frames(scene, cameras: Iterable[Camera], size: tuple[int, int] = (102
 
     Parameters
     ----------
-    scene
+    scene : Scene, surface, scan, or path-like
         As of `render`; with `scheduler` the path of a surface's file, which all workers see.
     cameras : iterable of Camera
         Such as `turntable` or `CameraPath.frames`.
-    size, device, options
+    size, device, options : optional
         As of `render`.
     scheduler : str or distributed.Client, optional
         A Dask scheduler whose workers draw: "tcp://host:8786", or "local" for processes of this machine.
 
-    Yields
-    ------
-    Frame
+    Returns
+    -------
+    iterator of Frame
         See `write_video`, which takes them one by one.
+
+    Raises
+    ------
+    InputError
+        Something that cannot be drawn; with `scheduler` a scene that is not the path of a file.
     """
     if scheduler is not None:
         from .remote import remote_frames
@@ -276,6 +285,11 @@ def save_cameras(cameras, path, names=None) -> None:
         .json
     names : list of str, optional
         Of a list or path; by default their numbers.
+
+    Raises
+    ------
+    InputError
+        Something else than cameras, names that are not theirs, or a place that cannot be written.
     """
     moving = isinstance(cameras, CameraPath)
     if isinstance(cameras, dict):
