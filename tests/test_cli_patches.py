@@ -91,7 +91,7 @@ def test_drawing_options_reach_the_renderer(folder, capsys):
     (["build", "cloud.ply", "x.clsurf", "--patches", "9", "--error", "auto"], "between 0 and 1"),
     (["build", "cloud.ply", "x.clsurf", "--patches", "9", "--degree", "2"], "--degree: an option of --kind slim"),
     (["build", "cloud.ply", "x.clsurf", "--kind", "slim", "--precise"], "--precise: an option of --kind patches"),
-    (["build", "cloud.ply", "x.clsurf", "--kind", "voxels"], "slim, patches or surfels"),
+    (["build", "cloud.ply", "x.clsurf", "--kind", "voxels"], "slim, patches, surfels or scale_map"),
     (["build", "cloud.ply", "x.clsurf", "--nodes", "1"], "from 2 to 256"),
     (["build", "cloud.ply", "x.clsurf", "--nodes", "17x"], "17x9"),
     (["build", "cloud.ply", "x.clsurf", "--nodes", "many"], "17x9"),
@@ -144,7 +144,7 @@ def test_cameras():
 
 
 def test_recipes(device):
-    assert recipe().slim == {"degree": 2, "error": 0.01} and recipe().kind == ""
+    assert recipe().slim == {"degree": 2, "error": None} and recipe().kind == ""
     assert recipe(error="auto").slim["error"] == "auto"
     made = recipe("patches", error="0.001", nodes="9x5", views=3)
     assert made.patches == {"nodes": (9, 5), "views": 3, "error": 0.001} and made.kind == "patches"
