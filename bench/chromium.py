@@ -92,7 +92,7 @@ class Browser:
         self.process.wait(timeout=30)
 
 
-def wait_for(condition, seconds: float = 20.0):
+def wait_for(condition, seconds: float = 60.0):
     """Return what the condition gives once it is true; fail after so long."""
     end = time.monotonic() + seconds
     while True:

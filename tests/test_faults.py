@@ -140,22 +140,38 @@ def test_a_device_that_fails_in_the_middle(slim, monkeypatch, code, kind):
     """A launch that fails is one of clsurf's errors; the next call works, on a new context if the device was lost."""
     selector = os.environ.get("CLSURF_DEVICE") or "pocl"
     device = open_device(selector)
-    wanted = picture(slim, device)
-    launches, launch = [], Kernel._launch
-
-    def failing(self, *arguments):
-        launches.append(self.label)
-        if len(launches) == 3:
-            raise cl.RuntimeError(types.SimpleNamespace(code=lambda: code, what=lambda: "launch", routine=lambda: ""))
-        return launch(self, *arguments)
-    monkeypatch.setattr(Kernel, "_launch", failing)
+    wanted = first_hit(slim, device)
+    fail_at(monkeypatch, 2, code)
     with pytest.raises(kind, match="clsurf devices") as caught:
-        picture(slim, device)
+        first_hit(slim, device)
     assert "\n" not in str(caught.value)
     monkeypatch.undo()
     again = open_device(selector)
     assert (again is device) == (kind is DeviceMemoryError)
-    np.testing.assert_array_equal(picture(slim, again), wanted)
+    np.testing.assert_array_equal(first_hit(slim, again), wanted)
+
+
+def first_hit(slim, device):
+    return clsurf.trace(slim, [[0.9, 0.1, 5.0]], [[0.0, 0.0, -1.0]], device=device).position
+
+
+def fail_at(monkeypatch, number: int, code: int) -> None:
+    """Make the launch of that number fail."""
+    launches, launch = [], Kernel._launch
+
+    def failing(self, *arguments):
+        launches.append(self.label)
+        if len(launches) == number:
+            raise cl.RuntimeError(types.SimpleNamespace(code=lambda: code, what=lambda: "launch", routine=lambda: ""))
+        return launch(self, *arguments)
+    monkeypatch.setattr(Kernel, "_launch", failing)
+
+
+def test_a_picture_that_runs_out_of_memory_is_drawn_in_bands(slim, device, monkeypatch):
+    """A launch in the middle of a frame that finds no room: the picture comes all the same."""
+    wanted = picture(slim, device)
+    fail_at(monkeypatch, 3, cl.status_code.OUT_OF_RESOURCES)
+    np.testing.assert_allclose(picture(slim, device), wanted, atol=1e-3)
 
 
 def test_too_little_device_memory_is_told_and_forgotten(slim, device, monkeypatch):

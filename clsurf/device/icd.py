@@ -89,10 +89,13 @@ def prepare() -> None:
     if _prepared or not sys.platform.startswith("linux"):
         return
     _prepared = True
-    # PoCL has no device where it cannot make its cache: a home that cannot be written (containers, services).
-    pocl = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/tmp") / ".cache") / "pocl"
-    if not os.environ.get("POCL_CACHE_DIR") and not can_be_made(pocl / "kcache"):
+    # PoCL has no device where it cannot make its cache, and pyopencl fails where it cannot make its own: a home that
+    # cannot be written (containers, services).
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/tmp") / ".cache")
+    if not os.environ.get("POCL_CACHE_DIR") and not can_be_made(base / "pocl" / "kcache"):
         os.environ["POCL_CACHE_DIR"] = str(cache_folder() / "pocl")
+    if not can_be_made(base / "pyopencl") or not can_be_made(base / "pytools"):
+        os.environ["XDG_CACHE_HOME"] = str(cache_folder())
     if os.environ.get("OCL_ICD_VENDORS"):
         return
     entries = wanted_entries()

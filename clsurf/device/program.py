@@ -1,6 +1,5 @@
 """Programs and kernels: built once per context and text, launched with a label, profiled on request."""
 
-import functools
 import hashlib
 import os
 import time
@@ -13,7 +12,6 @@ import pyopencl as cl
 
 from ..errors import KernelBuildError
 from .arrays import DeviceArray
-from .icd import cache_folder, can_be_made
 from .sources import argument_dtypes, kernel_text
 
 # -w: PoCL prints its compiler's warnings straight to the terminal.
@@ -87,13 +85,6 @@ class Profile:
         return "\n".join(lines)
 
 
-@functools.cache
-def program_cache() -> str | None:
-    """Return the folder of pyopencl's cache of programs where its own, None, cannot be made: it would fail then."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/tmp") / ".cache")
-    return None if can_be_made(base / "pyopencl") else str(cache_folder() / "pyopencl")
-
-
 def build_program(device, path: str, constants: dict | None):
     """Compile the kernel file `path` for `device`; return (program, text)."""
     text = kernel_text(path, device.own_constants | (constants or {}))
@@ -107,7 +98,7 @@ def build_program(device, path: str, constants: dict | None):
         with warnings.catch_warnings():
             # Drivers chat on success; the text matters only where the build fails.
             warnings.filterwarnings("ignore", category=cl.CompilerWarning)
-            program.build(options=BUILD_OPTIONS, cache_dir=program_cache())
+            program.build(options=BUILD_OPTIONS)
     except cl.RuntimeError as error:
         raise KernelBuildError(f"kernel {path}: {device.name} does not compile it:\n{error}") from None
     return program, text

@@ -56,6 +56,8 @@ def part_folder(folder: Path, number: int) -> Path:
 def write_index(folder: Path, values: dict, bounds: NDArray, surfels: NDArray, kind: str = "slim") -> None:
     """Write the root of a surface whose parts are there, all of `kind`: after this the folder is a store."""
     from .store import VERSION, create_array
+    for left in (folder / "parts").glob(".*"):  # of a worker that was killed while it wrote
+        shutil.rmtree(left, ignore_errors=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         zarr.create_group(LocalStore(folder / "parts"), attributes={})
