@@ -129,7 +129,7 @@ class Device:
         """Raise DeviceMemoryError where the named buffers would not fit; call it before allocating them."""
         total, largest = sum(nbytes.values()), max(nbytes, key=nbytes.get, default=None)
         # A CPU device's memory is the host's; PoCL reports a share of it only.
-        limit = self.memory_bytes if self.kind != "cpu" else max(self.memory_bytes, _host_memory_bytes())
+        limit = self.memory_bytes if self.kind != "cpu" else max(self.memory_bytes, host_memory_bytes())
         if total > limit:
             raise DeviceMemoryError(f"device {self.name}: needs {total / 1e9:.2f} GB ({largest} alone "
                                     f"{nbytes[largest] / 1e9:.2f} GB), has {limit / 1e9:.2f} GB: use a smaller scan or "
@@ -246,7 +246,8 @@ class Device:
         del done
 
 
-def _host_memory_bytes() -> int:
+def host_memory_bytes() -> int:
+    """Return the bytes of the machine's memory, 0 where they are not known."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (ValueError, OSError, AttributeError):

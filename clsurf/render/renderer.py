@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..device import Device, Profile, open_device
+from ..device import Device, Profile, host_memory_bytes, open_device
 from ..errors import DeviceError, DeviceMemoryError, InputError
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
@@ -245,7 +245,8 @@ class Renderer:
                 return draw(scene, camera, picture)
             except DeviceMemoryError as error:
                 failed = error
-            if not scene.surfaces:
+            # Bands and the picture they make are in memory together, with room for what draws them.
+            if not scene.surfaces or 3 * picture_bytes(picture, asked) > host_memory_bytes():
                 raise failed
             self._give_back()
             return draw_in_bands(draw, scene, camera, picture, cull)
@@ -361,6 +362,12 @@ def checked_channels(channels) -> tuple[str, ...]:
         got = ", ".join(map(str, channels)) or "none"
         raise InputError(f"channels: expected some of {', '.join((*CHANNELS, *DIFFERENTIALS))}, got {got}")
     return channels
+
+
+def picture_bytes(size: tuple[int, int], channels) -> int:
+    """Return the bytes of a picture's channels."""
+    parts = [CHANNELS.get(name, (3 if name.startswith("direction") else 1, np.float32))[0] for name in channels]
+    return 4 * size[0] * size[1] * sum(max(count, 1) for count in parts)
 
 
 def checked_drawing(name: str, given):
