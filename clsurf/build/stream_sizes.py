@@ -7,7 +7,7 @@ import numpy as np
 from ..device import Device
 from ..errors import InputError
 
-FIXED_BYTES = 420_000_000  # of a process with its driver, which compiles kernels at first
+FIXED_BYTES = 620_000_000  # of a process with its driver, which compiles kernels at first (PoCL: 140 MB of these)
 BYTES_PER_CELL_POINT = 1100  # at the peak of a cell's build, halo and the next cell's points counted in
 BYTES_PER_CHUNK_POINT = 400  # of the chunk at hand and the one read ahead
 MOST_CHUNK = 1_000_000
