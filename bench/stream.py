@@ -22,7 +22,7 @@ SAMPLE = 50  # every so many of the points is measured
 GENERATED = (10_000_000, 50_000_000)
 QUICK = (200_000, 1_000_000)
 CHILD = """
-import json, resource, sys
+import json, sys
 from clsurf.build.slim import build_slim
 path, out, selector, tolerance = sys.argv[1:]
 build_slim(path, out=out, memory_limit="1GB", device=selector, tolerance=float(tolerance) or None)
