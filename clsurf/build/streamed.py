@@ -105,12 +105,13 @@ class Build:
         count = int(runs.counts.sum())
         if not count:
             raise InputError(f"{self.source_path}: expected points, got none that are finite")
-        origin, diagonal = box_of(runs)
+        thin = thinning(count, self.sizes.thin)
+        origin, diagonal = box_of(runs, thin // THINNED)
         if not diagonal > 0:
             raise InputError("scan: expected points with some extent, got all of them at one place")
         noise, neighbours = measure(runs, diagonal, self.device)
         error = automatic_error(noise) if self.options.error == "auto" else float(self.options.error)
-        thin, spacing, width = thinning(count, self.sizes.thin), noise.spacing * diagonal, runs.lattice.width
+        spacing, width = noise.spacing * diagonal, runs.lattice.width
         rings = int(np.ceil(2 * LARGEST * np.sqrt(thin / THINNED) * spacing / width))
         cuts = cut_cells(runs.cells, runs.counts, with_halo(self.sizes.cell, rings * width / max(spacing, 1e-300)))
         first = 1 if len(cuts) == 2 or self.options.patches is not None else first_fine_level(noise.spacing, thin)

@@ -12,13 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..build.radius import segment_end
-from ..errors import InputError
 from ..io.parts import joined
 from ..io.stored import StoredSurface
-from ..sizes import parse_bytes
 from ..surface.placed import Placed
-from ..surface.slim import SlimSurface
+from ..surface.slim import SlimSurface, segment_end
 from .scene import Scene
 
 BYTES = 180  # of a surfel: its arrays, and those of the device
@@ -213,14 +210,6 @@ def resident_scene(scene: Scene, residents, camera, size, lod: float, budget: in
             surface = part if matrix is None else Placed(part, matrix)
         surfaces.append(surface)
     return replace(scene, surfaces=surfaces), complete
-
-
-def checked_budget(budget) -> int:
-    """Return a budget in bytes, or raise InputError."""
-    number = parse_bytes(budget, "budget")
-    if number is None or number <= 0:
-        raise InputError(f"budget: expected bytes or a text such as '2GB', got {budget!r}")
-    return number
 
 
 def shown(parts: list[SlimSurface], stored: StoredSurface) -> SlimSurface:
