@@ -66,7 +66,8 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
 
 def show(figures: dict) -> None:
     """Print the figures."""
-    rows = [(name, f"{one['points']:,}", f"{one['seconds']:.1f}", f"{one['cpu_seconds']:.1f}", f"{one['peak_bytes'] / 1e6:.0f}",
+    rows = [(name, f"{one['points']:,}", f"{one['seconds']:.1f}", f"{one['cpu_seconds']:.1f}",
+             f"{one['peak_bytes'] / 1e6:.0f}",
              f"{one['surfels']:,}", f"{one['within']:.2%}" if "within" in one else f"{one['bound']:.3g} bound")
             for name, one in figures.items() if isinstance(one, dict)]
     print_table(("scan", "points", "s", "CPU s", "peak MB", "surfels", f"within {TOLERANCE} m"), rows)
