@@ -72,11 +72,12 @@ def cut_cells(cells: NDArray, counts: NDArray, most: int) -> NDArray:
         """Return the ends of the ranges between `first` and `last`, all within one node of 2^bits fine cells across."""
         if total[last] - total[first] <= most or last - first <= 1 or bits == 0:
             return [last]
-        step = np.uint64(3 * (bits - 1))
-        child = cells[first:last] >> step
-        ends = first + np.append(np.flatnonzero(child[1:] != child[:-1]) + 1, last - first)
+        # Looked up, not compared: arrays of all cells at each of 21 depths were 370 MB of a scan of 50M points.
+        node = int(cells[first]) >> 3 * bits
+        after = np.array([8 * node + child + 1 << 3 * (bits - 1) for child in range(8)], np.uint64)
+        ends = first + np.searchsorted(cells[first:last], after)
         out, start, joined = [], first, False
-        for end in ends.tolist():
+        for end in np.unique(ends[ends > first]).tolist():
             inner = ranges(start, end, bits - 1)
             held = total[end] - total[out[-2] if len(out) > 1 else first] if joined and out else 0
             if joined and len(inner) == 1 and held <= most:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
+from ..device.arrays import give_back
 from ..io.chunks import Chunk, Source
 from ..io.colors import as_rgba8
 from ..io.files import write_array
@@ -203,7 +204,10 @@ class Runs:
             about.append(json.loads((folder / f"{name}.json").read_bytes()))
         self.most = max((one["most"] for one in about), default=0.0)
         self.whole = all(one["whole"] for one in about)
-        self.cells = np.unique(np.concatenate(each)) if each else np.zeros(0, np.uint64)
+        every = np.concatenate([np.zeros(0, np.uint64), *each])
+        every.sort()
+        self.cells = runs_of(every)[0]
+        del every
         self.counts = np.zeros(len(self.cells), np.int64)
         self._place = []  # of a run's cells among all
         for number, starts in enumerate(self._starts):
@@ -211,6 +215,7 @@ class Runs:
             each[number] = None
             self.counts[place] += np.diff(starts)
             self._place.append(place.astype(np.int32))
+        give_back()
         self._blocks, lengths = runs_of(self.cells >> np.uint64(3 * BLOCK_BITS))
         self._block_first = np.concatenate([[0], np.cumsum(lengths)])
 
