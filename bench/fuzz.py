@@ -147,7 +147,7 @@ def stores(folder: Path, mesh, cloud, enter, found: dict) -> None:
     place = folder / "streamed"
     place.mkdir()
     clsurf.save(clsurf.models.torus(400), place.with_suffix(".ply"))
-    clsurf.build_slim(place.with_suffix(".ply"), error=0.05, out=place / "seed.clsurf", memory_limit="400MB")
+    clsurf.build_slim(place.with_suffix(".ply"), error=0.05, out=place / "seed.clsurf", memory_limit="1GB")
     # Read as it is opened, and whole.
     found["folder .clsurf"] = Seed(place, (), "seed.clsurf", "stored")
     found["whole folder .clsurf"] = Seed(place, (), "seed.clsurf")
