@@ -17,7 +17,6 @@ from .common import (
     SizeOption,
     Steps,
     checked_out,
-    is_surface,
     parsed_size,
 )
 from .lights import LightOption, MaterialOption, MirrorOption, OcclusionOption, ShadowsOption, SkyOption, lighting
@@ -40,13 +39,14 @@ from .recipe import (
     KindOption,
     MapSizeOption,
     PatchesOption,
-    Recipe,
     SpacingOption,
     parsed_error,
     recipe,
 )
+from .sources import loaded_surface
 
-SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
+SourceArgument = Annotated[str, typer.Argument(help="A surface, or a scan (its surface is then built first), or the "
+                                               "address of a streamed surface.")]
 LodOption = Annotated[float, typer.Option(help="slim: projected diameter in pixels below which coarser surfels serve; "
                                           "8 is the fast mode, 0 draws leaves only; surfels: the same near "
                                           "silhouettes.")]
@@ -206,24 +206,11 @@ def report(source: SourceArgument,
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     chosen = clsurf.open_device(device or None)
-    thing = loaded_surface(source, how, chosen, steps)
+    thing = loaded_surface(source, how, chosen, steps, whole=True)
     with steps.step("report"):
-        clsurf.report(thing, out, view.camera(thing, picture_size), picture_size, title=source.name, lod=lod,
+        clsurf.report(thing, out, view.camera(thing, picture_size), picture_size, title=Path(source).name, lod=lod,
                       patches=drawing, device=chosen)
     steps.say(f"page: {out.resolve()}")
-
-
-def loaded_surface(source: Path, how: Recipe, device, steps: Steps, as_it_is: bool = False):
-    """Return the surface in the file `source`, or the one built from the scan in it; `as_it_is`: the scan."""
-    import clsurf
-    with steps.step("load"):
-        thing = clsurf.load(source)
-    steps.say(f"  {thing}")
-    if not as_it_is and not is_surface(thing):
-        with steps.step("build"):
-            thing = how.build(thing, device, steps)
-        steps.say(f"  {thing}")
-    return thing
 
 
 def checked_drawing(nodes: str, cells: str, alpha: bool):

@@ -18,7 +18,8 @@ FASTEST = 200.0  # pictures a second that a canvas asks for: at 60 its waiting c
 
 
 def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (1024, 768), up=(0, 1, 0),
-         host: str = "127.0.0.1", port: int = 0, folder=".", device=None, report=None, **options):
+         host: str = "127.0.0.1", port: int = 0, folder=".", device=None, report=None, scans=None,
+         shows: str = "surface", **options):
     """Look at a scene interactively.
 
     Parameters
@@ -43,8 +44,12 @@ def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (102
     report : callable, optional
         Called with lines worth telling (the URL, distances, screenshots); by default they are printed, or in a notebook
         only shown in the picture.
+    scans : Mesh, PointCloud, RangeScan, placed, or list of those or None, optional
+        What each of the surfaces was made from: the key t shows the scan as it is, or both.
+    shows : str
+        What is shown at first: "surface", "scan" or "both".
     options
-        Of `Renderer.render`, such as shading, patches, background.
+        Of `Renderer.render`, such as shading, points, background; `budget`: bytes for each `StoredSurface`.
 
     Returns
     -------
@@ -62,7 +67,7 @@ def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (102
     module = backend_module(chosen)
     if report is None:
         report = (lambda line: None) if chosen in ("notebook", "offscreen", "terminal") else _tell
-    viewer = Viewer(scene, camera, size, up, folder, device, report, **options)
+    viewer = Viewer(scene, camera, size, up, folder, device, report, scans=scans, shows=shows, **options)
     # Its word on Ctrl-C is none of the user's business.
     logging.getLogger("rendercanvas").setLevel(logging.ERROR)
     try:
