@@ -1,9 +1,11 @@
 """Where the viewer is shown: a window, a notebook, a browser, a terminal, or nowhere, all through rendercanvas."""
 
+import contextlib
 import importlib
 import logging
 import os
 import secrets
+import signal
 import sys
 
 from ..errors import InputError
@@ -81,7 +83,7 @@ def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (102
             _window(viewer, module, size)
         else:
             attached(viewer, module.RenderCanvas(title="clsurf", max_fps=20), module.loop)
-            module.loop.run()
+            _run(module.loop)
     except BaseException:
         viewer.close()
         raise
@@ -199,8 +201,20 @@ def _window(viewer: Viewer, module, size) -> None:
     except Exception as error:
         raise InputError(f"backend window: cannot be opened: {' '.join(str(error).split())[:150]}: "
                          "try --backend browser") from None
-    module.loop.run()
+    _run(module.loop)
     canvas.close()
+
+
+def _run(loop) -> None:
+    """Run a loop until the user leaves, by Ctrl-C and by a closed terminal too."""
+    before = None
+    with contextlib.suppress(ValueError, AttributeError):  # not the main thread, Windows
+        before = signal.signal(signal.SIGHUP, lambda *_: loop.stop())
+    try:
+        loop.run()
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGHUP, before)
 
 
 def _browser(viewer: Viewer, module, size, host: str, port: int) -> None:
