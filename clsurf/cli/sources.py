@@ -28,6 +28,15 @@ def loaded_surface(source, how: Recipe, device, steps: Steps, as_it_is: bool = F
     return thing.load() if whole and isinstance(thing, clsurf.StoredSurface) else thing
 
 
+def surface_in(source, as_it_is: bool, steps: Steps):
+    """Return the surface in a file, or with `as_it_is` the scan: what workers of a scheduler read for themselves."""
+    thing = loaded(source, steps)
+    if not as_it_is and not is_surface(thing):
+        raise InputError(f"scheduler: expected a surface, which the workers read, got a {type(thing).__name__} in "
+                         f"{source}: build it first (clsurf build), or draw it --as scan")
+    return thing
+
+
 def built(scan, how: Recipe, device, steps: Steps):
     """Return the surface of a scan."""
     with steps.step("build"):
