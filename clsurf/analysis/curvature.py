@@ -35,6 +35,7 @@ from .scan_points import scan_points
 
 NOISY = (0.05, 0.3)  # point spacings of noise above which normals are averaged, and averaged again
 NORMAL_REACH = 4.0  # point spacings that they are averaged over
+AROUND = 8  # known points that a normal is taken from where a point's own is of no use
 FAR = 1e6  # coordinate beyond which a query is as good as infinitely far, in the tree's units
 # Newton steps onto the blend: a scan's own points lie within the noise of it, other points come from a tangent plane.
 OWN_STEPS, QUERY_STEPS = 1, 3
@@ -244,9 +245,9 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
     report("curvature", 0.0)
     out = device.empty((tree.count, 16), np.float32)
     evaluate(surfels, tree.sorted, tree.count, tree.padded, device.upload(tree.order), out, OWN_STEPS)
-    values = found.spread(device.download(out))
+    values = _with_mean_normals(surfels, (found.position - middle) / unit, device.download(out))
     report("curvature", 1.0)
-    return _in_world(values, unit, world_middle)
+    return _in_world(found.spread(values), unit, world_middle)
 
 
 @dataclass(eq=False)
@@ -274,6 +275,23 @@ def _plan(tree: PointTree, radius: float | None, report) -> _Plan:
     found = RADIUS_RATIO * risk.least_risk_radius(samples, fits, sigma)
     report("noise", 1.0)
     return _Plan(tree, risk.block_radii(tree, samples, found), sigma / spacing, spacing)
+
+
+def _with_mean_normals(surfels: SurfelTree, position: NDArray, values: NDArray) -> NDArray:
+    """Return the values (n, 16), unknown ones once more with the mean normal of the nearest known points.
+
+    A normal that contradicts all surfels is one of a sliver among the faces, or a turned one.
+    """
+    known = np.isfinite(values[:, 6])
+    if known.all() or not known.any():
+        return values
+    unknown = np.flatnonzero(~known)
+    index = nearest(position[known], min(AROUND, np.count_nonzero(known)), position[unknown], surfels.device)[0]
+    normal = values[known][index, 3:6].mean(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    local = np.concatenate([position[unknown], normal], axis=1).astype(np.float32)
+    values[unknown] = _at_positions(surfels, local, OWN_STEPS, lambda *_: None)
+    return values
 
 
 def _near_scan(tree: PointTree, queries: NDArray, device: Device) -> NDArray:

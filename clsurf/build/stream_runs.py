@@ -299,12 +299,15 @@ def _read_into(file, rows: NDArray, at: int) -> None:
 def write_whole(path: Path, content) -> None:
     """Write bytes or an array so that the file appears whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with open(temporary, "wb") as file:
-        if isinstance(content, np.ndarray):
-            write_array(file, np.ascontiguousarray(content))
-        else:
-            file.write(content)
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            if isinstance(content, np.ndarray):
+                write_array(file, np.ascontiguousarray(content))
+            else:
+                file.write(content)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def chunk_written(folder: Path, number: int) -> bool:

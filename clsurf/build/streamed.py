@@ -19,7 +19,7 @@ from ..device import Device, open_device
 from ..device.arrays import give_back
 from ..errors import InputError
 from ..io.chunks import Source, open_source
-from ..io.files import writable_place
+from ..io.files import one_line, writable_place
 from ..io.layout import from_arrays, to_arrays
 from ..io.parts import part_folder, write_index, write_part
 from ..io.store import load_store
@@ -286,8 +286,9 @@ def begin(path, out: Path, options: Options, sizes: Sizes, device: Device) -> Bu
         shutil.rmtree(folder)
     elif folder.exists():
         log.info("%s: going on with it", folder)
+    folder.mkdir(exist_ok=True)
+    write_whole(old, text.encode())  # first: without it the folder is no build to go on with
     (folder / "work" / "runs").mkdir(parents=True, exist_ok=True)
-    write_whole(old, text.encode())
     return Build(folder, device)
 
 
@@ -306,9 +307,23 @@ def build_streamed(path, out, degree=2, error="auto", tolerance=None, memory_lim
         How much is taken at once, in place of what `memory_limit` says.
     patches : PatchRequest, optional
         Build patches, as `clsurf.build.patches` has them, in place of surfels.
+
+    Raises
+    ------
+    InputError
+        Also a disk that is full: what is done stays.
     """
+    try:
+        return _streamed(path, Path(out), degree, error, tolerance, memory_limit, report, device, scheduler, sizes,
+                         patches)
+    except OSError as problem:
+        raise InputError(f"{out}: the build stopped: {one_line(problem.strerror or problem)}: what is done stays in "
+                         f"{Path(out).name}.part, and the same call goes on with it") from problem
+
+
+def _streamed(path, out, degree, error, tolerance, memory_limit, report, device, scheduler, sizes, patches) -> Path:
     name = device if isinstance(device, str) else None  # of the workers' device
-    device, out = open_device(device), Path(out)
+    device = open_device(device)
     out = out if out.is_dir() else writable_place(out)
     sizes = sizes_of(memory_limit) if sizes is None else sizes
     source = path if isinstance(path, Source) else open_source(path, sizes.chunk)

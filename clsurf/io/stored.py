@@ -1,5 +1,6 @@
 """Surfaces that stay in their store: read in parts, from disk or over the network."""
 
+import json
 import warnings
 import weakref
 from pathlib import Path
@@ -150,6 +151,15 @@ def _store(place: str):
     if not path.exists():
         raise InputError(f"{place}: no such .clsurf store")
     return LocalStore(path, read_only=True) if path.is_dir() else ZipStore(path, mode="r")
+
+
+def in_parts(path) -> bool:
+    """Return whether `path` is the folder of a SLIM surface in parts."""
+    try:
+        about = json.loads((Path(path) / "zarr.json").read_text())
+        return about["attributes"]["kind"] == "slim_parts"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def open_surface(place, budget: int | str = BUDGET) -> StoredSurface:

@@ -19,7 +19,7 @@ from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .average import average, fine_channels
-from .backdrop import checked_background, lay_over
+from .backdrop import around, checked_background, lay_over
 from .bands import draw_in_bands
 from .camera import Camera
 from .checked import checked_channels, checked_lod, checked_size, picture_bytes
@@ -234,7 +234,7 @@ class Renderer:
                 self._draw(large, scene, camera, replace(look, lod=FACTOR * lod, cost=False), floats, lighting, FACTOR)
                 cover_edges(self.device, large, edges, self.device.upload(floats[8:12]), arrays["color"])
             if mirrored:
-                reflect(self.device, scene, camera, shading, back, origin, floats, lighting, arrays)
+                reflect(self.device, scene, camera, shading, around(back, scene), origin, floats, lighting, arrays)
             if factor > 1:
                 arrays = average(self.device, arrays, picture, factor, wanted, curved, self._scratch.lanes)
             if "color" in wanted:
