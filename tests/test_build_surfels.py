@@ -257,6 +257,18 @@ def test_triangle_maps(form):
     assert np.sqrt((np.concatenate(errors)**2).mean()) < EIGHT_BIT and flips <= 0.002 * 36 * len(s) / 5
 
 
+def test_of_sheets_above_each_other_the_nearest_to_the_plane_counts(form):
+    """Three squares that face the same way, the outer ones with other normals: the surfel lies in the middle one."""
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    vertices = np.concatenate([square + np.array([0, 0, h]) for h in (0.0, 0.1, 0.2)])
+    faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * k for k in range(3)])
+    normals = np.repeat([[0.6, 0, 0.8], [0, 0, 1], [0, 0.6, 0.8]], 4, axis=0)
+    s = build_surfels(Mesh(vertices, faces, normals.astype(np.float32)), map_size=6, hybrid=True, device=form)
+    assert len(s) == 1 and abs(s.positions[0, 2] + s.origin[2] - 0.1) < 0.01
+    covered = s.normal_atlas[:, 3] > 0
+    assert covered.sum() > 9 and (twin.angles(s.normal_atlas[covered], np.array([0, 0, 1.0])) < 0.5).all()
+
+
 @pytest.mark.parametrize("hybrid", (False, True))
 def test_maps_keep_their_side_of_a_thin_sheet(hybrid, device):
     if hybrid:

@@ -36,12 +36,17 @@
 #define LANE_Y(pixel) ((pixel) >> 3)
 #define PAIRS __global const uint2 *
 #define SKIP(pair, bits) if (!((pair).y & (bits))) continue;
+#define KEEP(pair)
+#define KEEP_REST(from, to)
 #else
 #define LANE_X(first) (LANE_INDEX & 3)
 #define LANE_Y(first) (LANE_INDEX >> 2)
 // The pairs of one block, a segment of the bin's list at a time: what remains has no unpredictable branch.
-#define PAIRS const uint2 *
+#define PAIRS uint2 *
 #define SKIP(pair, bits)
+// Pass 1 leaves those that pass 2 may blend.
+#define KEEP(pair) pairs[kept++] = pair;
+#define KEEP_REST(from, to) for (int rest = from; rest < to; rest++) pairs[kept++] = pairs[rest];
 #define SEGMENT 256
 INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *kept) {
   int n = 0;
@@ -87,27 +92,30 @@ INLINE VI texels_at(__global const float *k, VF u, VF v, VF inverse) {
 }
 
 // Pass 1: the largest K between `smallest` and `largest`, in front of those in `best`, its side and its surfel;
-// (rx, ry, rz) are the rays, model space.
-INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global const float *records,
+// (rx, ry, rz) are the rays, model space. Of private pairs those remain whose discs lie over a pixel, `*total` of them.
+INLINE int frontmost(PAIRS pairs, int *total, uint block, float bucket, __global const float *records,
                      __global const uint *atlas, VF px, VF py, VF rx, VF ry, VF rz, VF smallest, VF largest,
                      VF *best, VF *at, VF *facing, VI *nearest, int *cost) {
-  int more = 1;
+  int more = 1, count = *total, kept = 0;
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
     float near = near_of_key(pair.y) - bucket;
     VI open = IS_PERSPECTIVE ? near * *best < 1.0f : near < -*best;
-    if (!any_lane(open)) { count = 0; more = 0; continue; }  // PoCL is slower with a break
+    if (!any_lane(open)) { KEEP_REST(e, count) count = 0; more = 0; continue; }  // PoCL is slower with a break
     SKIP(pair, block)
     __global const float *k = records + (size_t)INDEX_OF(pair) * RECORD_FLOATS;
     VF u, v, one, where = see(k, px - k[XR], py - k[YR], &u, &v, &one);
+    VF away2 = u * u + v * v;
+    *cost += 1;
+    if (!any_lane(away2 < one)) continue;
+    KEEP(pair)
     VF key = where;
     if (k[FACE] < 0.0f) key = IS_PERSPECTIVE ? where - k[BIAS] * where * where : where - k[BIAS];
-    VI good = (u * u + v * v < k[CORE2] * one) & (where < largest) & (key > *best);
+    VI good = (away2 < k[CORE2] * one) & (where < largest) & (key > *best);
     if (IS_PERSPECTIVE) good = good & (where > 0.0f);
 #if CLIP_PLANES
     good = good & (where > smallest);
 #endif
-    *cost += 1;
     if (!any_lane(good)) continue;
     if (MAPS && !(as_int(k[FLAGS]) & IS_PLAIN)) {
       VF inverse = IS_PERSPECTIVE ? 1.0f / where : (VF)(1.0f);
@@ -127,6 +135,7 @@ INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global 
     *nearest = SEL(*nearest, (VI)(as_int(k[ID])), good);
 #endif
   }
+  *total = kept;
   return more;
 }
 
@@ -216,14 +225,15 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   sum.weight = sum.depth = sum.x = sum.y = sum.z = sum.red = sum.green = sum.blue = 0.0f;
   sum.number = 0;
 #if VW == 1
-  frontmost(pairs, count, 1u << quarter, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest,
+  int all = count;
+  frontmost(pairs, &all, 1u << quarter, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest,
             largest, &best, &first, &facing, &nearest, &cost);
 #else
   uint2 kept[SEGMENT];
   int more = 1, n = 0;
   for (int from = 0; from < count && more; from += SEGMENT) {
     n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
-    more = frontmost(kept, n, 0u, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest, largest,
+    more = frontmost(kept, &n, 0u, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest, largest,
                      &best, &first, &facing, &nearest, &cost);
   }
 #endif

@@ -7,7 +7,7 @@ from clsurf.surface.surfel import decoded_normals
 
 FALL, FACING = 4.0, 1e-3  # kernels/build/normal_maps.cl
 SLAB, LEAN, EDGE, BACK, CORE = 0.3, 0.25, 0.02, 0.25, 0.85  # clsurf/render/surfels.py, kernels/render/*surfels.cl
-RIM_SPREAD, RIM_LEAST, RIM_COSINE, RELIEF, RIM, TRIM = 2.5, 0.1, 0.4, 0.75, 0.75, 0.5
+RIM_SPREAD, RIM_LEAST, RIM_COSINE, RELIEF, RIM, TRIM = 2.5, 0.1, 0.4, 0.75, 0.35, 0.5
 
 
 def surfel_radii(positions, normals, neighbours, overlap):
