@@ -34,16 +34,22 @@ from .motion import (
 )
 from .output import AntialiasOption, BackgroundOption, BitsOption, ExposureOption, ToneOption, output
 from .raw_scans import AsOption, AttributeOption, EyeDomeOption, PointSizeOption, point_drawing, wants_scan
+from .recipe import BitsOption as MapBitsOption
 from .recipe import (
+    CenterOption,
     DegreeOption,
     ErrorOption,
+    HitOption,
     HybridOption,
     KindOption,
+    LayersOption,
     MapSizeOption,
     PatchesOption,
     SpacingOption,
+    TexelsOption,
     parsed_error,
     recipe,
+    with_scale_map,
 )
 from .sources import loaded_surface, surface_in
 
@@ -63,6 +69,8 @@ FormOption = Annotated[str, typer.Option(help="scale_map: cast (rays of pixels) 
 FacesOption = Annotated[int, typer.Option(help="scale_map: subdivisions of the geosphere, 0 to 9; 6: 81,920 "
                                           "triangles.")]
 MapNormalsOption = Annotated[str, typer.Option(help="scale_map: auto, stored, neighbours or gradient.")]
+StoredNormalsOption = Annotated[bool, typer.Option("--stored-normals", help="scale_map: build it with the model's "
+                                                   "normals.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
 LookOption = Annotated[str, typer.Option(help="phong, physical, matcap, normal, flat, reflection (lines); slim: "
                                               "ball_size, ball_level.")]
@@ -199,6 +207,10 @@ def report(source: SourceArgument,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
+           texels: TexelsOption = None, bits: MapBitsOption = None, layers: LayersOption = None,
+           stored_normals: StoredNormalsOption = False, hit: HitOption = "", center: CenterOption = "",
+           interior: InteriorOption = 16.0, no_maps: NoMapsOption = False, form: FormOption = "cast",
+           faces: FacesOption = 6, normals: MapNormalsOption = "auto",
            device: DeviceOption = "", quiet: QuietOption = False):
     """Write one HTML page about a surface and a view of it: counts, operations, times, the picture."""
     import clsurf
@@ -208,12 +220,14 @@ def report(source: SourceArgument,
     checked_out(out, (".html", ".htm"))
     view = checked_view(direction, up, fov, eye, target, ortho)
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
+    how = with_scale_map(how, texels, bits, layers, stored_normals, hit, center, ("texels", "stored-normals"))
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    surfels, scale_map = clsurf.SurfelDrawing(interior, not no_maps), clsurf.ScaleMapDrawing(form, faces, normals)
     chosen = clsurf.open_device(device or None)
     thing = loaded_surface(source, how, chosen, steps, whole=True)
     with steps.step("report"):
         clsurf.report(thing, out, view.camera(thing, picture_size), picture_size, title=Path(source).name, lod=lod,
-                      patches=drawing, device=chosen)
+                      patches=drawing, surfels=surfels, scale_map=scale_map, device=chosen)
     steps.say(f"page: {out.resolve()}")
 
 
