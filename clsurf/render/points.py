@@ -230,7 +230,8 @@ def draw_points(device: Device, scratch: Scratch, grid: Grid, upload: CloudUploa
     unlit = shading.look == "phong" and (bool(drawing.eye_dome) or not upload.has_normals)
     constants = grid.layout.constants | {
         "VW": scratch.lanes, "TILE_BINS": grid.patch_bins, "HAS_NORMALS": upload.has_normals,
-        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost, "UNLIT": unlit}
+        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost, "UNLIT": unlit,
+        "MASKED": int(grid.masked)}
     tiles_x, group = -(-grid.bins_x // grid.patch_bins), 64 if scratch.lanes == 1 else 1
     tiles = tiles_x * -(-grid.bins_y // grid.patch_bins)
     device.kernel("render/tile_points.cl", constants=constants)(
