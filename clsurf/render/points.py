@@ -208,7 +208,7 @@ def project_points(device: Device, scratch: Scratch, grid: Grid, upload: CloudUp
         (upload.count,), (16,), view, upload.runs, upload.count, WIDEST_SHARE * lod, drawn, touch.full, touch.core,
         touch.keys, touch.buckets)
     tiles = [-(-n // grid.patch_bins) for n in (grid.bins_x, grid.bins_y)]
-    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN))
+    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN), masked=False)
     return drawn, touch.core, bin_pairs(device, scratch, coarse, touch, upload.count)
 
 
