@@ -26,9 +26,10 @@ class Size:
     points: int
     picture: tuple[int, int]
     rays: int
+    lit: tuple[int, int] = (480, 360)  # pictures with traced light, whose pixels cost ten times as much
 
 
-SIZES = {"tiny": Size(300, (40, 32), 40), "small": Size(20_000, (480, 360), 20_000)}
+SIZES = {"tiny": Size(300, (40, 32), 40, (20, 16)), "small": Size(20_000, (480, 360), 20_000)}
 
 
 def scans(size: Size) -> dict:
@@ -224,7 +225,7 @@ def materials(device, size, made):
                          materials=looks)
     for lanes in (16, 1):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
-            out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.picture, ("color",), background="sky",
+            out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.lit, ("color",), background="sky",
                                                     shading=clsurf.Shading(occlusion=32)).color
     return out
 
@@ -238,7 +239,7 @@ def light(device, size, made):
     out = {}
     for lanes in (16, 1):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
-            out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.picture, ("color",),
+            out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.lit, ("color",),
                                                     shading=shading).color
     return out
 

@@ -123,6 +123,51 @@ def test_a_full_disk_leaves_nothing_and_loses_nothing(tmp_path):
     assert all(path.read_text() == "old" for path in paths)
 
 
+STREAM = """
+import resource, signal, sys, warnings
+import clsurf
+warnings.simplefilter("ignore")
+def build():
+    return clsurf.build_slim(sys.argv[1], error=0.02, out=sys.argv[2], memory_limit="1GB")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+most = resource.getrlimit(resource.RLIMIT_FSIZE)
+for limit in map(int, sys.argv[3:]):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, most[1]))
+    try:
+        print("built", build())
+    except clsurf.Error as error:
+        print("refused" if chr(10) not in str(error) and ".part" in str(error) else error)
+resource.setrlimit(resource.RLIMIT_FSIZE, most)
+print(build())
+"""
+
+
+def test_a_streamed_build_on_a_full_disk_goes_on_when_there_is_room(device, tmp_path):
+    """No file may have more than 100 bytes, then 20 KB: an error each time; without a limit the same call ends."""
+    clsurf.save(clsurf.models.torus(20_000), tmp_path / "a.ply")
+    done = subprocess.run([sys.executable, "-c", STREAM, str(tmp_path / "a.ply"), str(tmp_path / "a.clsurf"), "100",
+                           "20000"], capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("refused\nrefused\nStoredSurface("), done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.clsurf", "a.ply"]
+    clsurf.build_slim(tmp_path / "a.ply", error=0.02, out=tmp_path / "b.clsurf", memory_limit="1GB", device=device)
+    one, other = clsurf.load(tmp_path / "a.clsurf"), clsurf.load(tmp_path / "b.clsurf")
+    np.testing.assert_array_equal(one.coefficients, other.coefficients)
+
+
+def test_a_compiler_cache_on_a_full_disk(tmp_path):
+    """pyopencl's cache of built kernels cannot be written: the kernel is built without it."""
+    text = ("import resource, signal, sys, clsurf; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+            "device = clsurf.open_device('pocl')\n"
+            "import pyopencl.cache as cache\n"
+            "def full(*_, **__): raise OSError(28, 'No space left on device')\n"
+            "cache._create_built_program_from_source_cached = full\n"
+            "print(clsurf.render(clsurf.models.sphere(300), size=(8, 8), device=device))")
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=240,
+                          env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)})
+    assert done.returncode == 0 and done.stdout.startswith("Frame(8 x 8"), done.stderr
+
+
 def test_a_cache_that_cannot_be_written(tmp_path):
     """A file where the cache folder should be: clsurf takes another place and draws."""
     blocked = tmp_path / "file"

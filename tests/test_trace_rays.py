@@ -10,6 +10,7 @@ from clsurf.errors import Cancelled, InputError
 from clsurf.render.renderer import Renderer
 from clsurf.surface.placed import placed
 from clsurf.trace import hits as hits_module
+from clsurf.trace.kinds import ANY, CLOSEST, traced
 from clsurf.trace.ray_slim import neighbour_lists
 from clsurf.trace.tree import node_boxes, plant
 
@@ -377,6 +378,21 @@ def test_odd_rays_miss(device, lanes, sphere, query):
         origins = np.array([[np.nan, 0, 0], [0, np.inf, 0], [1e9, 0, 0], [1e7, 0.1, 0.2], [3, 0.1, 0.2]])
         hits = clsurf.trace(thing, origins, (-1, 0, 0), query, device=device)
         assert hits.hit.tolist() == [False, False, True, True, True]
+
+
+@pytest.mark.parametrize("limit", [np.inf, np.nan, 3.4e38])
+def test_rays_without_a_farthest_limit_end(device, lanes, sphere, limit):
+    """Kernels given rays that nothing limits, which `trace` itself clips to the box: one hits, one misses."""
+    ball = clsurf.build_scale_map(sphere_mesh(), size=8, device=device)
+    surfels = clsurf.build_surfels(clsurf.models.torus(500), map_size=4, device=device)
+    lines = np.float32([[0.02, 0.03, -9, 0, 0, 0, 1, limit], [0.02, 9, -9, 0, 0, 0, 1, limit]])
+    for thing, bottom in ((sphere, -1), (sphere_mesh(), -1), (ball, -1), (surfels, None)):
+        held = traced(device, thing)
+        rays, hits = device.upload(lines), device.empty((2, 8), np.float32)
+        for mode in (CLOSEST, ANY):
+            held.launch(mode, 2, rays, hits)
+            z = (device.download(hits)[:, 0] - 9) * held.unit + held.center[2]
+            assert np.isinf(z[1]) and (bottom is None or abs(z[0] - bottom) < 3e-2 or mode == ANY)
 
 
 def test_odd_meshes(device, lanes):

@@ -18,6 +18,7 @@ from ..build.radius import robust_box
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
 from ..io import load
+from ..io.stored import StoredSurface
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -89,10 +90,10 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
 
     Parameters
     ----------
-    thing : Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Placed, str or PathLike
-        A path is read with `clsurf.load`. Normals say which way is out: they are taken from the scan, computed from the
-        faces, or estimated, in this order. Of a PatchSurface its opaque nodes, of a SurfelHierarchy its base surfels or
-        its mesh, of a ScaleMap its valid texels are taken as a scan.
+    thing : Mesh, PointCloud, RangeScan, SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap, Placed or
+        str or PathLike: a path is read with `clsurf.load`. Normals say which way is out: they are taken from the scan,
+        computed from the faces, or estimated, in this order. Of a PatchSurface its opaque nodes, of a SurfelHierarchy
+        its base surfels or its mesh, of a ScaleMap its valid texels are taken as a scan.
     points : (n, 3) array_like, optional
         World positions; the nearest place of the surface is measured. By default the scan's own points in their order,
         or the centres of a SLIM surface's leaves.
@@ -129,6 +130,8 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
         return _of_placed(thing, points, radius, progress, device)
     if isinstance(thing, SlimSurface):
         return _of_slim(thing, points, radius, report, device)
+    if isinstance(thing, StoredSurface):
+        return _of_stored(thing, points, radius, report, device)
     if isinstance(thing, PatchSurface):
         thing = patch_mesh(thing)
     if isinstance(thing, SurfelHierarchy):
@@ -138,7 +141,7 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
     if isinstance(thing, RangeScan):
         thing = thing.to_points()
     if not isinstance(thing, Mesh | PointCloud):
-        raise InputError("curvature: expected a Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, "
+        raise InputError("curvature: expected a Mesh, PointCloud, RangeScan, SlimSurface, StoredSurface, PatchSurface, "
                          f"SurfelHierarchy, ScaleMap, one of these placed, or a path, got {type(thing).__name__}")
     return _of_scan(thing, points, radius, report, device)
 
@@ -195,6 +198,24 @@ def _of_slim(surface: SlimSurface, points, radius, report, device: Device) -> Cu
     surfels = SurfelTree(device, surface.degree, leaves.records, leaves.padded, leaves.balls, leaves.boxes,
                          leaves.node_offset, leaves.top_level)
     return _in_world(_at_positions(surfels, local, 0, report), leaves.unit, middle)
+
+
+def _of_stored(stored: StoredSurface, points, radius, report, device: Device) -> Curvature:
+    """Measure a surface that stays in its store, with the parts around the points at hand."""
+    leaves = stored.leaves()
+    if points is None:
+        centers = [own.centers.astype(np.float64) + own.origin for own, _ in map(leaves.leaves, range(len(leaves)))]
+        points = places = np.concatenate(centers)
+    else:
+        places = project(stored, points, device).position
+    columns: dict[str, NDArray] = {}
+    for rows, parts in leaves.groups(places):
+        found = _of_slim(leaves.surface(parts)[0], points[rows], radius, report, device)
+        for name, array in vars(found).items():
+            columns.setdefault(name, np.full((len(points), *array.shape[1:]), np.nan))[rows] = array
+    if not columns:
+        return _of_slim(leaves.surface(range(len(leaves)))[0], points, radius, report, device)
+    return Curvature(**columns)
 
 
 def _of_scan(scan, points, radius, report, device: Device) -> Curvature:

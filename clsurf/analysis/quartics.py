@@ -25,7 +25,6 @@ TINY = 100  # points of a scan whose balls may grow to hold all of it
 # points hardly show these terms, the noise in them grows a hundredfold. Part of a torus with 0.1 % noise: RMS 0.0251 to
 # 0.0233, largest error 0.35 to 0.25; inside no difference.
 RIDGE = (0.003, 0.008)
-CENTER = 3  # state of a chosen point (spread_centers.cl)
 SURFEL, LEAF = 32, 24  # floats a record of fit_quartics.cl, and of a SLIM surface's leaf (build/project.py)
 
 
@@ -81,11 +80,11 @@ def spread_centers(tree: PointTree, spacing: NDArray) -> NDArray:
     device = tree.device
     first, end, colors = tree.cells(float(spacing.max()) * 1.001)
     first, end, spacing = device.upload(first), device.upload(end), device.upload(spacing)
-    state = device.zeros(tree.padded, np.uint8)
+    covered, chosen = device.zeros(tree.padded, np.uint8), device.zeros(tree.padded, np.uint8)
     choose = device.kernel("analysis/spread_centers.cl")
     for start, stop in itertools.pairwise(colors):
-        choose((stop - start,), (1,), stop - start, start, first, end, spacing, *tree.arguments, state)
-    return np.flatnonzero(device.download(state, copy=False)[:tree.count] == CENTER).astype(np.int32)
+        choose((stop - start,), (1,), stop - start, start, first, end, spacing, *tree.arguments, covered, chosen)
+    return np.flatnonzero(device.download(chosen, copy=False)[:tree.count]).astype(np.int32)
 
 
 def evaluate(surfels: SurfelTree, queries: DeviceArray, count: int, stride: int, order: DeviceArray, out: DeviceArray,

@@ -98,7 +98,11 @@ def build_program(device, path: str, constants: dict | None):
         with warnings.catch_warnings():
             # Drivers chat on success; the text matters only where the build fails.
             warnings.filterwarnings("ignore", category=cl.CompilerWarning)
-            program.build(options=BUILD_OPTIONS)
+            try:
+                program.build(options=BUILD_OPTIONS)
+            except (OSError, KeyError):  # pyopencl's own cache cannot be written, as on a full disk: then without it
+                program = cl.Program(device.context, text)
+                program.build(options=BUILD_OPTIONS, cache_dir=False)
     except cl.RuntimeError as error:
         raise KernelBuildError(f"kernel {path}: {device.name} does not compile it:\n{error}") from None
     return program, text

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +11,20 @@ from numpy.typing import NDArray
 from zarr.storage import LocalStore, ZipStore
 
 from clsurf.errors import Error, FileFormatError, InputError
+from clsurf.sizes import checked_budget
+from clsurf.surface.placed import Placed, placed
 from clsurf.surface.slim import SlimSurface
 
 from . import parts
 from .files import one_line
 from .layout import from_arrays
+from .stored_leaves import StoredLeaves
 
 # A store on the web cannot be listed.
 NAMES = ("centers", "radii", "normals", "normal_codes", "coefficients", "level", "leaf", "child_offset", "children",
          "fit_error", "origin")
 OPTIONAL = ("footprint", "colors")
+BUDGET = "1GB"
 
 
 class StoredSurface:
@@ -29,6 +34,9 @@ class StoredSurface:
     ----------
     place : path-like
         A .clsurf folder or zip, or a URL of a folder that fsspec reads, such as "https://host/name.clsurf".
+    budget : int or str
+        Bytes that its leaves may take in memory in `project`, `trace`, `curvature` and `error`, such as "1GB"; pictures
+        have the renderer's budget.
 
     Attributes
     ----------
@@ -45,8 +53,9 @@ class StoredSurface:
         No such store, or one that cannot be read.
     """
 
-    def __init__(self, place):
-        self.place = str(place)
+    def __init__(self, place, budget: int | str = BUDGET):
+        self.place, self.budget = str(place), checked_budget(budget)
+        self._leaves: StoredLeaves | None = None
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -106,6 +115,16 @@ class StoredSurface:
         arrays["children"] = children[keep]
         return from_arrays("slim", arrays, values)
 
+    def leaves(self) -> StoredLeaves:
+        """Return the leaves, which are read where they are asked for; those used last stay in memory."""
+        if self._leaves is None:
+            self._leaves = StoredLeaves(weakref.proxy(self), self.budget)
+        return self._leaves
+
+    def moved(self, matrix) -> Placed:
+        """Return this surface placed by the similarity `matrix` (4, 4)."""
+        return placed(self, matrix)
+
     def load(self) -> SlimSurface:
         """Return the whole surface."""
         if self._single:
@@ -118,7 +137,7 @@ class StoredSurface:
                 f"{self.place!r}, bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
 
     def __reduce__(self):
-        return StoredSurface, (self.place,)
+        return StoredSurface, (self.place, self.budget)
 
 
 def _store(place: str):
@@ -143,13 +162,15 @@ def in_parts(path) -> bool:
         return False
 
 
-def open_surface(place) -> StoredSurface:
+def open_surface(place, budget: int | str = BUDGET) -> StoredSurface:
     """Open a SLIM surface in a .clsurf store without reading it whole; see `StoredSurface`.
 
     Parameters
     ----------
     place : path-like or str
         A folder, a zip file, or an address that fsspec reads, such as https://host/survey.clsurf (extra ``scale``).
+    budget : int or str
+        See `StoredSurface`.
 
     Returns
     -------
@@ -160,4 +181,4 @@ def open_surface(place) -> StoredSurface:
     InputError, FileFormatError
         Nothing there, or something else than the store of a SLIM surface.
     """
-    return StoredSurface(place)
+    return StoredSurface(place, budget)

@@ -32,7 +32,7 @@ __kernel void project_surfels(__global const float *view, __global const float *
   VF depth = -(scale * (view[6] * x + view[7] * y + view[8] * z) + view[OFFSET + 2]);
   VF r = scale * field[S_RADIUS], inv_r = 1.0f / r;
   // The frame of the normal (common/frame.clh in lanes), turned into view space.
-  VF sign = SEL((VF)(1.0f), (VF)(-1.0f), AS_VI(nz) < 0);
+  VF sign = SIGN_OF(nz);
   VF a = -1.0f / (sign + nz), b = nx * ny * a;
   VF ax = 1.0f + sign * nx * nx * a, ay = sign * b, az = -sign * nx;
   VF bx = b, by = sign + ny * ny * a, bz = -ny;

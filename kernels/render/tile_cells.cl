@@ -18,11 +18,7 @@
 #define CAST 1
 #endif
 #define GRIDS (CAST ? 6 : 10)  // of one layer
-#if defined(__clang__) && __has_builtin(__builtin_ctz)
-#define FIRST_BIT(x) __builtin_ctz(x)
-#else
-#define FIRST_BIT(x) (31 - (int)clz((x) & -(x)))
-#endif
+#define FIRST_BIT LOWEST_BIT
 typedef struct {
   VF z;       // -1 / depth, or depth where the picture is orthographic
   VI seen;    // node A of the cell times 4, 2 for the triangle DCB, 1 where it is seen from behind; -1: nothing

@@ -7,15 +7,16 @@
 #endif
 
 // What the winners show at pixels (px, py); `payload` NO_SAMPLE: nothing.
-INLINE Seen resolve(__global const float *view, __global const float *points, size_t stride, __global const int *drawn,
-                    __global const uchar4 *colors, __global const float *linear, VU payload, VF px, VF py) {
+INLINE void resolve(__global const float *view, __global const float *points, size_t stride, __global const int *drawn,
+                    __global const uchar4 *colors, __global const float *linear, VU payload, VF px, VF py, Seen *seen) {
   Seen out;
   VF zero = 0.0f, one = 1.0f, away;
   out.depth = EMPTY_DEPTH;
   out.nx = zero; out.ny = zero; out.nz = one; out.red = zero; out.green = zero; out.blue = zero;
   VI shown = payload != (VU)(NO_SAMPLE);
   uint some = lane_mask(shown);
-  if (!some) return out;
+  *seen = out;
+  if (!some) return;
   payload = SEL((VU)(((const uint *)&payload)[FIRST_LANE(some)]), payload, shown);
   const uint *at = (const uint *)&payload;
   VF x, y, z, radius, nx = zero, ny = zero, nz = zero;
@@ -25,8 +26,11 @@ INLINE Seen resolve(__global const float *view, __global const float *points, si
 #if HAS_NORMALS
   FETCHED(nx, PNORMAL) FETCHED(ny, PNORMAL + 1) FETCHED(nz, PNORMAL + 2)
 #endif
-  Disc d = disc_of(view, x, y, z, radius, nx, ny, nz);
-  VF depth = disc_depth(lens_of(view), &d, px, py, &away);
+  Disc d;
+  Lens lens;
+  disc_of(view, x, y, z, radius, nx, ny, nz, &d);
+  lens_of(view, &lens);
+  VF depth = disc_depth(lens, &d, px, py, &away);
 #if !HAS_NORMALS
   depth += BULGE * d.radius * VMIN(away, (VF)(4.0f));
 #endif
@@ -60,7 +64,7 @@ INLINE Seen resolve(__global const float *view, __global const float *points, si
   out.red = -out.red; out.green = -out.green; out.blue = -out.blue;
 #endif
 #endif
-  return out;
+  *seen = out;
 }
 
 __kernel void tile_points(__global const float *view, __global const uint2 *pairs, __global const uint *offsets,
@@ -135,15 +139,17 @@ __kernel void tile_points(__global const float *view, __global const uint2 *pair
     __global float *planes = all_planes + (size_t)bin * BIN_PIXELS * FIELDS;
 #if VW == 1
     int px = x * BIN + item % BIN, py = y * BIN + item / BIN;
-    Seen s = resolve(view, points, stride, drawn, colors, linear, payload_of(&to, SLOT_OF(px - to.x, py - to.y)),
-                     px + 0.5f, py + 0.5f);
+    Seen s;
+    resolve(view, points, stride, drawn, colors, linear, payload_of(&to, SLOT_OF(px - to.x, py - to.y)), px + 0.5f,
+            py + 0.5f, &s);
     store_seen(planes, was_touched, item, &s, surface);
 #else
     for (int q = 0; q < 64 / VW; q++) {
       int qx = q / (16 / VW) % 2 * 4, qy = q / (32 / VW) * 4 + q % (16 / VW) * (VW / 4);
       int sx = b % TILE_BINS * BIN + qx, sy = b / TILE_BINS * BIN + qy;
       VF px = TO_VF((VI)(to.x + sx) + (LANE_INDEX & 3)) + 0.5f, py = TO_VF((VI)(to.y + sy) + (LANE_INDEX >> 2)) + 0.5f;
-      Seen s = resolve(view, points, stride, drawn, colors, linear, payload_of(&to, SLOT_OF(sx, sy)), px, py);
+      Seen s;
+      resolve(view, points, stride, drawn, colors, linear, payload_of(&to, SLOT_OF(sx, sy)), px, py, &s);
       store_seen(planes, was_touched, qy * BIN + qx, &s, surface);
     }
     touched[bin] = (was_touched ? touched[bin] : 0) + cost[b];

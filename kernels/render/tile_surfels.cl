@@ -56,14 +56,12 @@ INLINE int filtered(__global const uint2 *pairs, int count, uint shift, uint2 *k
 
 // Records are scattered: asking for all of a bin's at once hides their latency.
 INLINE void fetch_ahead(__global const uint2 *pairs, int count, __global const float *records) {
-#ifdef __clang__
-#if __has_builtin(__builtin_prefetch)
+#ifdef HAS_PREFETCH
   for (int e = 0; e < count; e++) {
     size_t record = (size_t)(records + (size_t)INDEX_OF(pairs[e]) * RECORD_FLOATS);
     __builtin_prefetch((const void *)record);
     __builtin_prefetch((const void *)(record + 64));
   }
-#endif
 #endif
 }
 
