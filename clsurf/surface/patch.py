@@ -4,7 +4,6 @@ Source: the paper on spatial patches, sections 2 and 6: a patch is an origin P, 
 m x n nodes, each a colour and a displacement d: N_ij = P + i a_x + j a_y + d_ij a_z.
 """
 
-import functools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -192,7 +191,7 @@ class PatchSurface:
         """Bounding box (2, 3) float64 of the opaque nodes, world space; NaN where there is none."""
         return self._box.copy()
 
-    @functools.cached_property
+    @cached_property
     def _box(self) -> NDArray:
         # Of 5.5 million nodes 1 s, and a scene asks for that of every placement.
         if not self.opaque.any():
