@@ -1,12 +1,13 @@
 """The job `instances` on a small model: ten placements share what one takes, and copies of the model are found out."""
 
+import importlib
+
 import numpy as np
 import pytest
 
 from bench import instances as job
 from bench.build import WrongAnswer
 from clsurf.device import open_device
-from clsurf.io.dispatch import save
 from clsurf.models.basic import sphere
 from clsurf.render.scene import Scene
 
@@ -34,13 +35,14 @@ def test_quick_job(device, one_kind, capsys):
     assert "times" in capsys.readouterr().out
 
 
-def test_copies_that_share_nothing_stop_it(device, one_kind, monkeypatch, tmp_path):
-    save(sphere(10), tmp_path / "cloud.ply")
+def test_copies_that_share_nothing_stop_it(device, one_kind, monkeypatch):
+    alive = []
 
     class Copies(Scene):
         def __init__(self, surfaces):
             super().__init__([s if not hasattr(s, "surface") else sphere(20_000).moved(s.matrix) for s in surfaces])
-    monkeypatch.setattr("clsurf.render.scene.Scene", Copies)
+            alive.append(self)
+    monkeypatch.setattr(importlib.import_module("clsurf.render.scene"), "Scene", Copies)
     with pytest.raises(WrongAnswer, match=r"at most 1\.15 times"):
         job.measure(device, quick=True)
 

@@ -193,11 +193,12 @@ def test_no_stage_draws_bins_without_edges(device, lanes, kind, monkeypatch):
 
 
 @pytest.mark.parametrize("lanes", (16, 1))
-@pytest.mark.parametrize("kind", ("mesh", "scale map", "surfels"))
+@pytest.mark.parametrize("kind", ("mesh", "cloud", "scale map", "surfels"))
 def test_every_representation(device, lanes, kind):
     """The same promise for what has tiles of its own: edges as with 4 x 4 samples, the rest untouched."""
     mesh = ball_mesh()
-    surface = {"mesh": lambda: mesh, "scale map": lambda: clsurf.build_scale_map(mesh, size=16, device=device),
+    surface = {"mesh": lambda: mesh, "cloud": lambda: clsurf.models.basic.sphere(3000),
+               "scale map": lambda: clsurf.build_scale_map(mesh, size=16, device=device),
                "surfels": lambda: clsurf.build_surfels(mesh, device=device)}[kind]()
     with Renderer(device, lanes=lanes) as r:
         plain, got, fine = (r.render(Scene([surface], [Light()], Material("flat", (0.2, 0.4, 0.6))), CAMERA, SIZE,

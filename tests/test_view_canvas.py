@@ -98,7 +98,7 @@ def test_a_terminal(ball):
         os.execv(sys.executable, [sys.executable, "-m", "clsurf", "view", str(ball), "--backend", "terminal", "-q"])
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 60, 0, 0))
     said, start, quits = b"", time.monotonic(), 0
-    while time.monotonic() - start < 90:
+    while time.monotonic() - start < 240:
         if select.select([terminal], [], [], 0.3)[0]:
             try:
                 data = os.read(terminal, 65536)

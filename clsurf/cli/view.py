@@ -38,7 +38,7 @@ def view(sources: Annotated[list[str], typer.Argument(help="Surfaces or scans, s
     import clsurf
 
     from ..render.renderer import checked_size
-    from ..render.resident import checked_budget
+    from ..sizes import checked_budget
     from ..view.canvas import BACKENDS, backend_module, chosen_backend
     from .sources import scans_and_surfaces
     # Every option is checked before the work.

@@ -215,7 +215,7 @@ def project_points(device: Device, scratch: Scratch, grid: Grid, upload: CloudUp
         (upload.count,), (16,), view, upload.runs, upload.count, WIDEST_SHARE * lod, drawn, touch.full, touch.core,
         touch.keys, touch.buckets)
     tiles = [-(-n // grid.patch_bins) for n in (grid.bins_x, grid.bins_y)]
-    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN))
+    coarse = replace(grid, size=(tiles[0] * BIN, tiles[1] * BIN), masked=False)
     return drawn, touch.core, bin_pairs(device, scratch, coarse, touch, upload.count)
 
 
@@ -237,7 +237,8 @@ def draw_points(device: Device, scratch: Scratch, grid: Grid, upload: CloudUploa
     unlit = shading.look == "phong" and (bool(drawing.eye_dome) or not upload.has_normals)
     constants = grid.layout.constants | {
         "VW": scratch.lanes, "TILE_BINS": grid.patch_bins, "HAS_NORMALS": upload.has_normals,
-        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost, "UNLIT": unlit}
+        "HAS_COLOR": colors is not None, "COUNT_COST": look.cost, "UNLIT": unlit,
+        "MASKED": int(grid.masked)}
     tiles_x, group = -(-grid.bins_x // grid.patch_bins), 64 if scratch.lanes == 1 else 1
     tiles = tiles_x * -(-grid.bins_y // grid.patch_bins)
     device.kernel("render/tile_points.cl", constants=constants)(

@@ -84,7 +84,11 @@ __kernel void tile_patches(__global const float *view, __global const short *box
     some_wanted |= wanted[i];
   }
   if (!some_wanted) return;
+#if VW == 1  // the array did not outlive PoCL's barriers
+#define WANTED_HERE(b) WANTED((bin_y + (b) / TILE_BINS) * bins_x + bin_x + (b) % TILE_BINS)
+#else
 #define WANTED_HERE(bin) wanted[bin]
+#endif
 #else
 #define WANTED_HERE(bin) 1
 #endif
