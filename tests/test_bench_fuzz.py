@@ -15,6 +15,22 @@ def test_damage_is_repeatable_and_changes_files():
     assert sum(fuzz.damaged(whole, random) != whole for _ in range(50)) > 40
 
 
+def test_whole_files_of_every_format_are_read(device, tmp_path):
+    """What is damaged later is good before; a copy of it damages one file and leaves the whole one alone."""
+    found = fuzz.seeds(tmp_path, device)
+    assert {how for how in (seed.how for seed in found.values())} == {"load", "cameras", "path", "picture", "stored"}
+    reader = fuzz.Reader()
+    try:
+        for name, seed in found.items():
+            assert (name, reader.read(seed.folder / seed.read, seed.how)[0]) == (name, "read")
+    finally:
+        reader.stop()
+    before = {path: path.read_bytes() for path in found["folder .clsurf"].folder.rglob("*") if path.is_file()}
+    for i in range(20):
+        fuzz.damaged_copy(found["folder .clsurf"], tmp_path / f"copy {i}", np.random.default_rng(i))
+    assert all(path.read_bytes() == whole for path, whole in before.items())
+
+
 def test_the_reader_tells_what_became_of_a_file(tmp_path):
     clsurf.save(clsurf.models.torus(50), tmp_path / "a.ply")
     (tmp_path / "b.ply").write_bytes(b"ply\ngarbage")
@@ -32,7 +48,7 @@ def test_a_reader_that_fails_is_seen(tmp_path, monkeypatch, text, word):
     """A process that ends, raises, hangs or takes memory instead of reading."""
     path = tmp_path / "a.ply"
     clsurf.save(clsurf.models.torus(50), path)
-    monkeypatch.setattr(fuzz, "READER", fuzz.READER.replace("load(line.rstrip(chr(10)))", f"exec({text!r})"))
+    monkeypatch.setattr(fuzz, "READER", fuzz.READER.replace("READ[how](path)", f"exec({text!r})"))
     monkeypatch.setattr(fuzz, "SECONDS", 0.5)
     reader = fuzz.Reader()
     try:
