@@ -21,6 +21,7 @@ JOBS = {
     "scans": "meshes and clouds drawn as they are: errors against ray casting, frames, VTK",
     "fuzz": "damaged files of every format: crashes, hangs, memory",
     "devices": "one answer everywhere: hashes of all devices' answers and how far they are apart",
+    "instances": "ten placements of a model: memory of the device and the host over that of one",
     "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",
     "scale_map": "spherical scale maps: closed forms and orders, builds, frames, geospheres, morphs",
     "stream": "scans larger than memory: time, peak memory, autzen's points within 0.3 m, scaling to 50 million points",

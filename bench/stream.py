@@ -22,12 +22,12 @@ SAMPLE = 50  # every so many of the points is measured
 GENERATED = (10_000_000, 50_000_000)
 QUICK = (200_000, 1_000_000)
 CHILD = """
-import json, sys
+import json, sys, time
 from clsurf.build.slim import build_slim
 path, out, selector, tolerance = sys.argv[1:]
 build_slim(path, out=out, memory_limit="1GB", device=selector, tolerance=float(tolerance) or None)
 peak = next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM"))  # of this process alone
-print(json.dumps({"peak_bytes": 1024 * int(peak)}))
+print(json.dumps({"peak_bytes": 1024 * int(peak), "cpu_seconds": time.process_time()}))
 """
 
 
@@ -37,8 +37,9 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
     Returns
     -------
     dict
-        Per scan: points, seconds, peak_bytes (of the whole process), surfels, and for autzen the share of the points
-        within TOLERANCE; ``linear``: seconds a point of the largest generated scan over those of the smallest.
+        Per scan: points, seconds, cpu_seconds (of all cores together), peak_bytes (of the whole process), surfels, and
+        for autzen the share of the points within TOLERANCE; ``linear``, ``linear_cpu``: seconds a point of the largest
+        generated scan over those of the smallest.
     """
     selector = "intel" if "intel" in device.platform_name.lower() else "pocl" if device.kind == "cpu" else device.name
     figures = {}
@@ -57,18 +58,20 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
             write_hills(path, count)
             figures[f"hills {count:,}"] = _built(path, Path(folder), selector, None)
     first, last = ([figures[f"hills {count:,}"] for count in (QUICK if quick else GENERATED)][k] for k in (0, -1))
-    figures["linear"] = (last["seconds"] / last["points"]) / (first["seconds"] / first["points"])
+    for name, seconds in (("linear", "seconds"), ("linear_cpu", "cpu_seconds")):
+        figures[name] = (last[seconds] / last["points"]) / (first[seconds] / first["points"])
     show(figures)
     return figures
 
 
 def show(figures: dict) -> None:
     """Print the figures."""
-    rows = [(name, f"{one['points']:,}", f"{one['seconds']:.1f}", f"{one['peak_bytes'] / 1e6:.0f}",
+    rows = [(name, f"{one['points']:,}", f"{one['seconds']:.1f}", f"{one['cpu_seconds']:.1f}",
+             f"{one['peak_bytes'] / 1e6:.0f}",
              f"{one['surfels']:,}", f"{one['within']:.2%}" if "within" in one else f"{one['bound']:.3g} bound")
             for name, one in figures.items() if isinstance(one, dict)]
-    print_table(("scan", "points", "s", "peak MB", "surfels", f"within {TOLERANCE} m"), rows)
-    print(f"time a point, largest over smallest: {figures['linear']:.2f}")
+    print_table(("scan", "points", "s", "CPU s", "peak MB", "surfels", f"within {TOLERANCE} m"), rows)
+    print(f"time a point, largest over smallest: {figures['linear']:.2f}, of all cores {figures['linear_cpu']:.2f}")
 
 
 def write_hills(path: Path, count: int) -> None:

@@ -327,11 +327,11 @@ def test_command_line(hills, device, tmp_path, capsys, monkeypatch):
     name = "intel" if "intel" in device.platform_name.lower() else "pocl"
     out = tmp_path / "a.clsurf"
     arguments = ["build", str(hills), str(out), "--memory", "1GB", "--error", "0.002", "--device", name]
-    build = streamed.Build.build
-    monkeypatch.setattr(streamed.Build, "build", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    cell = streamed.Build.cell
+    monkeypatch.setattr(streamed.Build, "cell", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
     assert main(arguments) == 130
     assert "a.clsurf.part keeps what is done" in capsys.readouterr().err and not out.exists()
-    monkeypatch.setattr(streamed.Build, "build", build)
+    monkeypatch.setattr(streamed.Build, "cell", cell)
     assert main(arguments) == 0 and out.is_dir() and not (tmp_path / "a.clsurf.part").exists()
     assert "surfels in" in capsys.readouterr().err
     assert main(["info", str(out)]) == 0

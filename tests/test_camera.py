@@ -2,10 +2,15 @@
 
 import numpy as np
 import pytest
+from test_render_triangles import globe
 
+from clsurf.build.scale_map import build_scale_map
+from clsurf.build.surfels import build_surfels
 from clsurf.errors import InputError
+from clsurf.models.basic import sphere
 from clsurf.render.camera import Camera
 from clsurf.render.frame import Frame
+from clsurf.render.scene import Scene
 from clsurf.surface.cloud import PointCloud
 
 BOX = np.array([[-1.0, -2.0, -0.5], [3.0, 1.0, 0.5]])
@@ -59,6 +64,18 @@ def test_framing_a_scan_is_centred_and_closer_than_its_box():
     x = p.cx + p.fx * view[:, 0] / -view[:, 2]
     assert min(x.min(), y.min()) >= -1e-3 and max(x.max(), y.max()) <= 1000 + 1e-3
     assert abs((1000 - y.max()) - y.min()) < 10 and abs((1000 - x.max()) - x.min()) < 10
+
+
+@pytest.mark.parametrize("make", (
+    lambda device: build_surfels(sphere(20_000), map_size=2, device=device),
+    lambda device: build_surfels(globe(40, 80), map_size=2, hybrid=True, device=device),
+    lambda device: build_scale_map(globe(40, 80), size=32, bits=16, device=device)), ids=("pure", "hybrid", "scale"))
+def test_surfels_and_scale_maps_are_framed_by_their_surface(make, device):
+    """The eye stands where the cone of view touches the unit sphere, not the corners of its box."""
+    surface = make(device)
+    for thing in (surface, Scene([surface])):
+        away = np.linalg.norm(Camera.framing(thing, (1, 1, 1), fov=40, margin=1.0).eye)
+        assert away == pytest.approx(1 / np.sin(np.radians(20)), abs=0.06)
 
 
 def test_intrinsics_scale_with_the_picture():

@@ -48,7 +48,10 @@ def test_render_trace_report_convert(files):
     run("render", files / "hybrid.clsurf", files / "b.exr", "--size", "60x50", "--no-maps", "--shadows")
     run("render", files / "mesh.ply", files / "c.png", "--size", "30x30", "--kind", "surfels", "--spacing", "0.2")
     run("trace", files / "pure.clsurf", "--output", files / "hits.npz", "--size", "20x20")
-    run("report", files / "pure.clsurf", "--out", files / "r.html", "--size", "60x60")
+    run("report", files / "pure.clsurf", "--out", files / "r.html", "--size", "60x60", "--interior", "20")
+    run("report", files / "mesh.ply", "--out", files / "m.html", "--size", "40x40", "--kind", "scale_map", "--texels",
+        "12", "--bits", "16", "--layers", "2", "--stored-normals", "--form", "geosphere", "--faces", "3", "--normals",
+        "stored")
     run("convert", files / "pure.clsurf", files / "points.ply")
     run("convert", files / "hybrid.clsurf", files / "faces.ply")
     run("curvature", files / "pure.clsurf", "--output", files / "k.npz")
@@ -56,6 +59,8 @@ def test_render_trace_report_convert(files):
     assert np.isfinite(np.load(files / "hits.npz")["distance"]).any()
     page = (files / "r.html").read_text()
     assert "Inner surfels" in page and "Levels drawn" in page
+    page = (files / "m.html").read_text()
+    assert "6 x 12 x 12, 2 layers" in page and "24 bits a texel" in page
     assert len(clsurf.load(files / "points.ply").points) == 1500
     assert len(clsurf.load(files / "faces.ply").faces) == len(uv_sphere(12, 20).faces)
     assert abs(np.median(np.load(files / "k.npz")["mean"]) - 1) < 0.05
@@ -78,7 +83,9 @@ def test_options_that_do_not_fit_are_refused(options, message):
 def test_mistakes_end_in_one_line(files, capsys):
     for arguments, says in ((("build", files / "cloud.ply", files / "x.clsurf", "--hybrid"), "hybrid: expected a mesh"),
                             (("build", files / "cloud.ply", files / "x.slim2t", "--kind", "surfels"), "a name that"),
-                            (("render", files / "pure.clsurf", files / "x.png", "--interior", "-3"), "interior")):
+                            (("render", files / "pure.clsurf", files / "x.png", "--interior", "-3"), "interior"),
+                            (("report", files / "mesh.ply", "--texels", "9"), "--texels: an option of --kind"),
+                            (("report", files / "mesh.ply", "--stored-normals"), "--stored-normals: an option of")):
         capsys.readouterr()
         run(*arguments, code=2)
         assert says in capsys.readouterr().err

@@ -202,6 +202,15 @@ def test_points_that_cannot_be_used_are_nan(device):
     assert np.nanmax(np.abs(found.mean - 1)) < 0.01
 
 
+def test_normals_of_slivers_do_no_harm(device):
+    points, normals, _, _ = curved.sphere(4000, 1.0)
+    again = points[::200] + 1e-4 * np.roll(normals[::200], 1, axis=1)
+    found = curvature(cloud_of(np.concatenate([points, again]), np.concatenate([normals, -normals[::200]])),
+                      device=device)
+    np.testing.assert_allclose(found.mean, 1, atol=0.1)
+    assert (np.einsum("ij,ij->i", found.normal[4000:], again) > 0.9).all()
+
+
 def test_copies_have_the_curvature_of_their_place(device):
     points, normals, _, _ = curved.sphere(1000, 1.0)
     plain = curvature(cloud_of(points, normals), device=device)

@@ -7,10 +7,12 @@ import warnings
 import distributed
 import numpy as np
 import pytest
+from reference.surfaces import sphere
 from test_build_streamed import ground, tree_bytes, write_las
 
 import clsurf
 from clsurf.build import streamed
+from clsurf.cli import main
 from clsurf.errors import InputError
 
 
@@ -60,6 +62,31 @@ def test_frames_of_a_path(device, cluster, tmp_path):
     assert len(frames) == 3
     for got, wanted in zip(frames, expected, strict=True):
         assert np.array_equal(got.depth, wanted.depth, equal_nan=True) and np.array_equal(got.color, wanted.color)
+
+
+def test_a_turntable_by_command(device, cluster, tmp_path, monkeypatch):
+    """The workers' pictures, with lights, material and tone, are those that one process writes."""
+    monkeypatch.setenv("CLSURF_DEVICE", "intel" if "intel" in device.platform_name.lower() else "pocl")
+    clsurf.save(sphere(300), tmp_path / "ball.clsurf")
+    looks = ["--size", "48x36", "--turntable", "3", "--sky", "studio", "--material", "gold", "--tone", "agx", "-q"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, more in (("here", []), ("there", ["--scheduler", cluster.scheduler_address,
+                                                   "--device", os.environ["CLSURF_DEVICE"]])):
+            assert main(["render", str(tmp_path / "ball.clsurf"), str(tmp_path / name), *looks, *more]) == 0
+    here, there = (sorted((tmp_path / name).iterdir()) for name in ("here", "there"))
+    assert len(here) == 3 and [path.read_bytes() for path in here] == [path.read_bytes() for path in there]
+
+
+@pytest.mark.parametrize(("source", "options", "says"), [
+    ("few.las", ["--turntable", "2"], "expected a surface"), ("few.las", [], "--turntable or --path"),
+    ("few.las", ["--turntable", "2", "--profile"], "--profile"),
+    ("ball.clsurf", ["--turntable", "2", "--scheduler", "nonsense://"], "nonsense")])
+def test_mistakes_are_one_line(hills_path, tmp_path, source, options, says, capsys):
+    clsurf.save(sphere(50), tmp_path / "ball.clsurf")
+    assert main(["render", str(tmp_path / source), str(tmp_path / "out"), "--scheduler", "local", "-q", *options]) == 2
+    said = capsys.readouterr().err.strip()
+    assert says in said and "\n" not in said
 
 
 def test_no_scheduler(hills_path, tmp_path):

@@ -9,6 +9,7 @@ from test_render_supersampling import half_plane
 
 import clsurf
 from clsurf.errors import InputError
+from clsurf.render import renderer
 from clsurf.render.camera import Camera
 from clsurf.render.coverage import FACTOR, edge_layout, mark_edges
 from clsurf.render.light import Light
@@ -166,6 +167,29 @@ def test_nothing_to_see(device):
 def test_wrong_options_say_what_is_expected(device, wrong):
     with Renderer(device) as r, pytest.raises(InputError, match="antialias"):
         r.render(sphere(20), None, (8, 8), **wrong)
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+@pytest.mark.parametrize("kind", ("slim", "mesh", "cloud", "patches", "scale map", "surfels"))
+def test_no_stage_draws_bins_without_edges(device, lanes, kind, monkeypatch):
+    """The large picture's bins that are not wanted stay as they were marked, in every kind's tile stage."""
+    mesh, marked = ball_mesh(), []
+    surface = {"slim": lambda: sphere(300), "mesh": lambda: mesh, "cloud": lambda: clsurf.models.basic.sphere(3000),
+               "patches": lambda: clsurf.models.perfect_sphere(radius=1.0),
+               "scale map": lambda: clsurf.build_scale_map(mesh, size=16, device=device),
+               "surfels": lambda: clsurf.build_surfels(mesh, device=device)}[kind]()
+
+    def watched(device, layout, *more, of=renderer.mark_edges):
+        edges, large = of(device, layout, *more)
+        marked.append((large, device.download(large.touched)))
+        return edges, large
+    monkeypatch.setattr(renderer, "mark_edges", watched)
+    with Renderer(device, lanes=lanes) as r:
+        r.render(Scene([surface]), CAMERA, SIZE, ("color",), antialias="coverage")
+        (large, before), = marked
+        after = device.download(large.touched)
+    assert (before == -2).any() and (before == -1).any()
+    assert (after[before == -2] == -2).all() and (after[before == -1] >= 0).sum() > 10
 
 
 @pytest.mark.parametrize("lanes", (16, 1))

@@ -7,9 +7,11 @@ from test_render_traced_light import HEIGHT, MATTE, RADIUS, ball, camera, ground
 
 from clsurf.errors import InputError
 from clsurf.render.camera import Camera
+from clsurf.render.material import Material
 from clsurf.render.renderer import Renderer
 from clsurf.render.scene import Scene
 from clsurf.render.shade import Light, Shading
+from clsurf.surface.cloud import PointCloud
 from clsurf.surface.patch import PatchSurface
 
 SIZE = (60, 45)
@@ -112,6 +114,43 @@ def test_colours_are_reflected(device):
     disc = reflected(frame, camera())[1]
     got = frame.color[frame.id == 0]
     assert np.allclose(got[disc > 0.1][:, :3], [1, 0, 0], atol=1e-3)
+
+
+SKY = np.zeros((32, 64, 3), np.float32)
+SKY[:16], SKY[16:] = (0.1, 0.2, 0.8), (0.3, 0.2, 0.1)  # above and below
+
+
+def test_mirrors_see_the_image_light_and_not_the_background(device):
+    """A perfect mirror under a blue sky is blue, whatever is behind the picture; without a sky it sees that."""
+    shading = Shading(mirror=1.0)
+    lights = (Light("image", picture=SKY, up=(0, 0, 1)),)
+    for lit, wanted in ((lights, (0.1, 0.2, 0.8)), (SUNNY, (0, 1, 0))):
+        frame = picture(device, [ground()], shading, lit, background=(0, 1, 0))
+        assert (frame.id == 0).sum() > 500
+        assert np.abs(frame.color[frame.id == 0][:, :3] - wanted).max() < 2e-3
+
+
+@pytest.mark.parametrize("normals", [True, False])
+@pytest.mark.parametrize("look", ["phong", "physical"])
+def test_clouds_mirror(device, normals, look):
+    """A cloud of a plane with normals mirrors what its plane would; without, discs face the eye and mirror what is
+    behind it. Its own points are no obstacles, and surfaces are seen in it."""
+    x, y = np.meshgrid(np.linspace(-4, 4, 161), np.linspace(-4, 4, 161))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    cloud = PointCloud(points, normals=np.tile((0.0, 0, 1), (len(points), 1)) if normals else None)
+    scene = Scene([cloud, ball()], (Light("image", picture=SKY, up=(0, 0, 1)),),
+                  [Material(look, mirror=1.0), Material("flat", (1.0, 0.0, 0.0))])
+    with Renderer(device) as r:
+        frame = r.render(scene, camera(), SIZE, ("color", "position", "normal", "id"))
+    disc = reflected(frame, camera())[1]
+    got = frame.color[frame.id == 0][:, :3]
+    assert len(got) > 300 and np.isfinite(got).all()
+    if normals:
+        sky, hit = got[disc < -0.1], got[disc > 0.1]
+        assert len(hit) > 50 and np.abs(sky - (0.1, 0.2, 0.8)).max() < 0.01
+        assert np.median(np.abs(hit - (1, 0, 0)).max(axis=1)) < 0.01
+    else:
+        assert np.abs(got - (0.1, 0.2, 0.8)).max() < 0.01
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.5, "half", (0.5, 2.0), [[0.5]], np.nan])

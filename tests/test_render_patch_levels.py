@@ -9,10 +9,11 @@ from scipy import ndimage
 from test_surface_patch import bowls
 
 from clsurf.build.quantize import quantized
+from clsurf.models.basic import sphere
 from clsurf.render.camera import Camera
 from clsurf.render.patch_drawing import PatchDrawing
 from clsurf.render.patch_forms import cull_patches
-from clsurf.render.patch_mips import halved, mip_levels, tent
+from clsurf.render.patch_mips import halved, mip_levels, opaque_area, tent
 from clsurf.render.patches import place_patches, project_patches, upload_patches
 from clsurf.render.renderer import Renderer
 from clsurf.render.shade import Shading
@@ -65,11 +66,43 @@ def test_levels_average_linear_light_and_keep_most_of_what_shows():
     assert shares[1] > shares[0] and (halved(rough(3, holes=1.0)).opaque == 0).all()
 
 
+def blobs(count=400, spacing=0.02):
+    """A sphere of patches whose opaque part is a disc in the middle, away from all borders."""
+    at = sphere(count)
+    normals = at.points.astype(np.float64)
+    side = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other, steps = np.cross(normals, side), np.arange(17) - 8
+    i, j = np.tile(steps, 17), np.repeat(steps, 17)
+    heights = np.sqrt(1 - spacing**2 * (i**2 + j**2)) - 1
+    d = np.where(i**2 + j**2 <= 50, np.rint(heights / 0.001), -128).astype(np.int8)
+    return PatchSurface(normals - 8 * spacing * (side + other), spacing * side, spacing * other,
+                        np.full(count, 0.001), (17, 17), np.tile(d, count))
+
+
+def test_patches_cover_far_away_what_they_cover_near(renderers):
+    """Opaque parts that no border node shows: a far sphere of them keeps its disc, and levels their area."""
+    surface = blobs()
+    own = opaque_area(surface)
+    assert own.min() > 0
+    for level in mip_levels(surface)[1:]:
+        assert (opaque_area(level) >= 0.9 * own).all() and opaque_area(level).mean() < 1.1 * own.mean()
+    for distance in (10.0, 40.0, 120.0):
+        camera = Camera.look_at((0, 0.6 * distance, 0.8 * distance), (0, 0, 0), fov=2 * 60 * 1.3 / distance)
+        for renderer in renderers[:2]:
+            near, far = (renderer.render(surface, camera, (48, 48), ("depth",),
+                                         patches=PatchDrawing(mip=mip, direct=False)) for mip in (False, True))
+            shown = [np.isfinite(frame.depth).sum() for frame in (near, far)]
+            assert shown[0] > 300 and shown[1] == pytest.approx(shown[0], rel=0.05)
+
+
 def test_levels_of_all_kinds():
     for surface in (bowls(2, colors=True)[0], bowls(2, precise=True)[0], bowls(2, colors=True, precise=True)[0],
                     joined(rough(2), rough(1, (4, 11)))):
         levels = mip_levels(surface)
-        assert all(len(s) == len(surface) for s in levels) and (levels[-1].size == 2).all()
+        assert all(len(s) == len(surface) for s in levels)
+        whole = [part.all() for part in np.split(surface.opaque, surface.node_offset[1:-1])]
+        assert (levels[-1].size[whole] == 2).all() and (levels[-1].size < surface.size).any()
         low, high = surface.bounds
         reach = 1e-3 * np.ptp(surface.bounds, axis=0) + np.linalg.norm(surface.axis_z, axis=1).max()
         for level in levels:

@@ -162,15 +162,15 @@ def test_blocks_hold_every_hit(device, torus, which):
     assert_blocks_hold_every_hit(device, torus, cameras()[which], (90, 70))
 
 
-def around_the_eye(degree, seed, count=200):
-    """Surfels whose balls reach the plane of an eye at the origin that looks along -z: facing every way, half of them
-    nearly that plane; their surfaces up to 0.9 radii off the ball's centre."""
+def around_the_eye(degree, seed, count=200, spread=1.0):
+    """Surfels whose balls reach the plane of an eye at the origin that looks along -z, centres up to `spread` radii to
+    the sides: facing every way, half of them nearly that plane; their surfaces up to 0.9 radii off the centre."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3)) * np.where(np.arange(count) % 2, 1, 0.15)[:, None]
     normals[::2, 2] += 1
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     radii = rng.uniform(0.5, 1.5, count)
-    centers = radii[:, None] * rng.uniform(-1, 1, (count, 3))
+    centers = radii[:, None] * rng.uniform(-1, 1, (count, 3)) * [spread, spread, 1]
     order = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3])[:{1: 1, 2: 6, 3: 10}[degree]]
     k = rng.uniform(-0.2, 0.2, (count, len(order)))
     k[:, 0] = rng.uniform(-0.9, 0.9, count)
@@ -181,9 +181,24 @@ def around_the_eye(degree, seed, count=200):
 @pytest.mark.parametrize("degree", (1, 2, 3))
 def test_blocks_at_the_eyes_plane(device, degree, fov, near):
     """Bounds and sides of surfels that reach the eye's plane; those with their centre behind it need `crosses`."""
-    for seed in range(2):
+    for seed, spread in enumerate((1.0, 1.0, 2.0)):
         camera = Camera.look_at((0, 0, 0), (0, 0, -1), fov=fov, near=near)
-        assert_blocks_hold_every_hit(device, around_the_eye(degree, seed), camera, (24, 18))
+        assert_blocks_hold_every_hit(device, around_the_eye(degree, seed, spread=spread), camera, (24, 18))
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_surfels_beside_the_eye_are_not_listed(device, lanes):
+    """A plain seen from 3 above it: the surfels along the eye's plane, right and left, touch no pixel. (Each used to
+    get the whole picture, or most of it.)"""
+    x, y = np.meshgrid(np.arange(-60.0, 61), np.arange(-8.0, 61), indexing="ij")
+    centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    surface = leaves(centers, np.full(x.size, 1.2), np.tile([0, 0, 1.0], (x.size, 1)), np.zeros((x.size, 6)), 2)
+    camera = Camera.look_at((0, 0, 3), (0, 10, 2), (0, 0, 1), fov=50)
+    full = device.download(staged(device, surface, camera, (160, 120), lanes=lanes)[5].full).astype(int)
+    blocks = np.maximum(full[:, 2] - full[:, 0] + 1, 0) * np.maximum(full[:, 3] - full[:, 1] + 1, 0)
+    beside = np.abs(centers[:, 1]) < 2.5
+    assert blocks[beside].sum() == 0 and blocks.sum() > 1000
+    assert blocks.max() < 40 * 30  # and no other has the whole picture
 
 
 def test_blocks_are_tight(device):

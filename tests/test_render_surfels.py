@@ -123,7 +123,7 @@ def test_maps_halve_the_error_of_normals(device):
     rough = torus(60_000)
     a = 0.04 * np.sin(25 * rough.points).sum(axis=1)
     surface = build_surfels(PointCloud(rough.points + a[:, None] * rough.normals), device=device)
-    camera = Camera.framing(surface, direction=(0.2, 0.3, 1), fov=35)
+    camera = Camera.framing(surface.bounds, direction=(0.2, 0.3, 1), fov=35, margin=1.6)
     with Renderer(device) as renderer:
         fine = renderer.render(surface, camera, (300, 300), ("normal",), lod=0.0).normal
         errors = []
@@ -182,6 +182,34 @@ def test_surfaces_of_all_kinds_meet_in_one_z_buffer(device, renderers):
             assert (frame.position[inside][:, 2] > -0.02).all()  # the plate hides what lies below it
             assert np.isnan(frame.mean[frame.id == number]).all() and np.isfinite(frame.mean[frame.id != number]).any()
         assert renderer.render(Scene([]), camera, (9, 9), ("depth",)).depth.shape == (9, 9)
+
+
+def test_supersampling_averages_the_finer_picture(ball, renderers):
+    """Twice as many samples are the picture of twice the size, level of detail and all, in light: edges apart."""
+    camera = Camera.look_at((0.5, 0.7, 4), (0, 0, 0), (0, 1, 0), 35)
+    for renderer in renderers:
+        fine = renderer.render(ball, camera, (80, 72), ("color", "depth", "normal"), Shading("normal"), lod=0.0)
+        both = renderer.render(ball, camera, (40, 36), ("color", "depth", "normal"), Shading("normal"), lod=0.0,
+                               supersampling=2)
+        plain = renderer.render(ball, camera, (40, 36), ("color",), Shading("normal"), lod=0.0)
+        blocks = fine.color.reshape(36, 2, 40, 2, 4)
+        mean = blocks.mean(axis=(1, 3))
+        np.testing.assert_allclose(both.color, mean, atol=2e-3)
+        seen = np.isfinite(fine.depth).reshape(36, 2, 40, 2)
+        edge = seen.any(axis=(1, 3)) & ~seen.all(axis=(1, 3))
+        assert edge.sum() > 20 and np.abs(plain.color - mean)[edge].max() > 0.1
+        assert (np.isfinite(both.depth) == seen.any(axis=(1, 3))).mean() > 0.97
+
+
+def test_a_closed_surface_keeps_its_outline_at_every_level(device):
+    """Discs that stand beside what lies below them are trimmed: coarse levels draw what the finest draws."""
+    surface = build_surfels(sphere(40_000), device=device)
+    camera = Camera.look_at((0.5, 0.7, 4), (0, 0, 0), (0, 1, 0), 35)
+    with Renderer(device) as renderer:
+        fine, coarse = (np.isfinite(renderer.render(surface, camera, (300, 300), ("depth",), lod=lod,
+                                                    surfels=SurfelDrawing(24.0)).depth) for lod in (0.0, 6.0))
+    outline = np.count_nonzero(fine[1:] != fine[:-1]) + np.count_nonzero(fine[:, 1:] != fine[:, :-1])
+    assert np.count_nonzero(coarse != fine) < 0.05 * outline
 
 
 # Options and input ----------------------------------------------------------------------------------------------------

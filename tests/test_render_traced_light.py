@@ -15,6 +15,7 @@ from clsurf.render.scene import Scene
 from clsurf.render.shade import Light, Shading, shading_floats
 from clsurf.render.tiles import view_floats
 from clsurf.render.traced_light import sphere_lamps
+from clsurf.surface.mesh import Mesh
 from clsurf.surface.patch import PatchSurface
 from clsurf.trace.kinds import Traced, traced
 from clsurf.trace.packets import trace_lights
@@ -222,10 +223,19 @@ def openness(surfaces, lanes=16):
     return frame.position[there].astype(float) + frame.origin, frame.color[there][:, 0]
 
 
-def test_patches_occlude():
-    """Under a square roof the ground sees that much less of the sky: cosine-weighted solid angle of a rectangle."""
-    at, light = openness([ground(), roof(side=65)])
-    bare = openness([ground()])[1]
+def floor():
+    """The ground as triangles."""
+    corners = np.array([[-4, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]], np.float32)
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+
+
+@pytest.mark.parametrize("below", [ground, floor])
+def test_patches_occlude(below):
+    """Under a square roof the ground sees that much less of the sky: cosine-weighted solid angle of a rectangle.
+
+    With a ground of triangles nothing of the scene casts by packets."""
+    at, light = openness([below(), roof(side=65)])
+    bare = openness([below()])[1]
     solid = 0.0
     for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):  # four rectangles from the point's own foot
         a, b = (1 + x * at[:, 0]) / 2.0, (1 + y * at[:, 1]) / 2.0

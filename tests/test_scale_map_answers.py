@@ -6,8 +6,7 @@ from reference import scale_map as twin
 from reference.trace_rays import unit
 
 import clsurf
-from clsurf.build.project_scale_map import closest_on_triangles
-from clsurf.build.triangles import nearest_triangles
+from clsurf.build.triangles import closest_on_triangles, nearest_triangles
 from clsurf.errors import InputError
 from clsurf.surface.scale_map import ScaleMap
 from clsurf.surface.scale_mesh import scale_mesh

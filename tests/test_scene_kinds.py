@@ -28,14 +28,14 @@ EXACT = PatchDrawing(direct=False, mip=False)
 SAG = 1 - np.cos(np.pi / 160) ** 2  # of the mesh's facets, two edges wide
 
 # A unit sphere about the origin in every kind, and how far the drawn surface is from it at most, as its makers state:
-# facets sag, a cloud's discs and surfels by half their radius squared, patches are a hundredth of a node off by their
-# steps, a scale map adds the sag of its texels to its mesh's, SLIM surfaces say it themselves.
+# facets sag, a cloud's discs by half their radius squared, patches are a hundredth of a node off by their steps, a
+# scale map adds the sag of its texels to its mesh's, SLIM surfaces and surfels say it themselves.
 SPHERES = {
     "slim": lambda device: with_bound(build_slim(sphere(20_000), error=0.0003, device=device)),
     "patches": lambda _: (perfect_sphere(radius=1.0), 1e-4),
     "mesh": lambda _: (globe(80, 160), SAG),
     "cloud": lambda _: (sphere(20_000), 0.5 * 0.034 ** 2 + 1e-4),
-    "surfels": lambda device: (build_surfels(sphere(20_000), device=device), 0.5 * 0.034 ** 2),
+    "surfels": lambda device: with_bound(build_surfels(sphere(20_000), device=device)),
     "scale map": lambda device: (build_scale_map(globe(80, 160), bits=16, device=device), 2 * SAG),
 }
 

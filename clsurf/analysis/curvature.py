@@ -18,6 +18,7 @@ from ..build.radius import robust_box
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
 from ..io import load
+from ..io.stored import StoredSurface
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -34,6 +35,7 @@ from .scan_points import scan_points
 
 NOISY = (0.05, 0.3)  # point spacings of noise above which normals are averaged, and averaged again
 NORMAL_REACH = 4.0  # point spacings that they are averaged over
+AROUND = 8  # known points that a normal is taken from where a point's own is of no use
 FAR = 1e6  # coordinate beyond which a query is as good as infinitely far, in the tree's units
 # Newton steps onto the blend: a scan's own points lie within the noise of it, other points come from a tangent plane.
 OWN_STEPS, QUERY_STEPS = 1, 3
@@ -88,10 +90,10 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
 
     Parameters
     ----------
-    thing : Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Placed, str or PathLike
-        A path is read with `clsurf.load`. Normals say which way is out: they are taken from the scan, computed from the
-        faces, or estimated, in this order. Of a PatchSurface its opaque nodes, of a SurfelHierarchy its base surfels or
-        its mesh, of a ScaleMap its valid texels are taken as a scan.
+    thing : Mesh, PointCloud, RangeScan, SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap, Placed or
+        str or PathLike: a path is read with `clsurf.load`. Normals say which way is out: they are taken from the scan,
+        computed from the faces, or estimated, in this order. Of a PatchSurface its opaque nodes, of a SurfelHierarchy
+        its base surfels or its mesh, of a ScaleMap its valid texels are taken as a scan.
     points : (n, 3) array_like, optional
         World positions; the nearest place of the surface is measured. By default the scan's own points in their order,
         or the centres of a SLIM surface's leaves.
@@ -128,6 +130,8 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
         return _of_placed(thing, points, radius, progress, device)
     if isinstance(thing, SlimSurface):
         return _of_slim(thing, points, radius, report, device)
+    if isinstance(thing, StoredSurface):
+        return _of_stored(thing, points, radius, report, device)
     if isinstance(thing, PatchSurface):
         thing = patch_mesh(thing)
     if isinstance(thing, SurfelHierarchy):
@@ -137,7 +141,7 @@ def curvature(thing, points=None, radius="auto", progress=None, device=None) -> 
     if isinstance(thing, RangeScan):
         thing = thing.to_points()
     if not isinstance(thing, Mesh | PointCloud):
-        raise InputError("curvature: expected a Mesh, PointCloud, RangeScan, SlimSurface, PatchSurface, "
+        raise InputError("curvature: expected a Mesh, PointCloud, RangeScan, SlimSurface, StoredSurface, PatchSurface, "
                          f"SurfelHierarchy, ScaleMap, one of these placed, or a path, got {type(thing).__name__}")
     return _of_scan(thing, points, radius, report, device)
 
@@ -196,6 +200,24 @@ def _of_slim(surface: SlimSurface, points, radius, report, device: Device) -> Cu
     return _in_world(_at_positions(surfels, local, 0, report), leaves.unit, middle)
 
 
+def _of_stored(stored: StoredSurface, points, radius, report, device: Device) -> Curvature:
+    """Measure a surface that stays in its store, with the parts around the points at hand."""
+    leaves = stored.leaves()
+    if points is None:
+        centers = [own.centers.astype(np.float64) + own.origin for own, _ in map(leaves.leaves, range(len(leaves)))]
+        points = places = np.concatenate(centers)
+    else:
+        places = project(stored, points, device).position
+    columns: dict[str, NDArray] = {}
+    for rows, parts in leaves.groups(places):
+        found = _of_slim(leaves.surface(parts)[0], points[rows], radius, report, device)
+        for name, array in vars(found).items():
+            columns.setdefault(name, np.full((len(points), *array.shape[1:]), np.nan))[rows] = array
+    if not columns:
+        return _of_slim(leaves.surface(range(len(leaves)))[0], points, radius, report, device)
+    return Curvature(**columns)
+
+
 def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
     report("points", 0.0)
     found = scan_points(scan, device)
@@ -223,9 +245,9 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
     report("curvature", 0.0)
     out = device.empty((tree.count, 16), np.float32)
     evaluate(surfels, tree.sorted, tree.count, tree.padded, device.upload(tree.order), out, OWN_STEPS)
-    values = found.spread(device.download(out))
+    values = _with_mean_normals(surfels, (found.position - middle) / unit, device.download(out))
     report("curvature", 1.0)
-    return _in_world(values, unit, world_middle)
+    return _in_world(found.spread(values), unit, world_middle)
 
 
 @dataclass(eq=False)
@@ -253,6 +275,23 @@ def _plan(tree: PointTree, radius: float | None, report) -> _Plan:
     found = RADIUS_RATIO * risk.least_risk_radius(samples, fits, sigma)
     report("noise", 1.0)
     return _Plan(tree, risk.block_radii(tree, samples, found), sigma / spacing, spacing)
+
+
+def _with_mean_normals(surfels: SurfelTree, position: NDArray, values: NDArray) -> NDArray:
+    """Return the values (n, 16), unknown ones once more with the mean normal of the nearest known points.
+
+    A normal that contradicts all surfels is one of a sliver among the faces, or a turned one.
+    """
+    known = np.isfinite(values[:, 6])
+    if known.all() or not known.any():
+        return values
+    unknown = np.flatnonzero(~known)
+    index = nearest(position[known], min(AROUND, np.count_nonzero(known)), position[unknown], surfels.device)[0]
+    normal = values[known][index, 3:6].mean(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    local = np.concatenate([position[unknown], normal], axis=1).astype(np.float32)
+    values[unknown] = _at_positions(surfels, local, OWN_STEPS, lambda *_: None)
+    return values
 
 
 def _near_scan(tree: PointTree, queries: NDArray, device: Device) -> NDArray:

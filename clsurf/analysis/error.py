@@ -17,6 +17,7 @@ from ..build.triangles import triangle_distances
 from ..device import open_device
 from ..errors import InputError
 from ..io import load
+from ..io.stored import StoredSurface
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -28,7 +29,7 @@ from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import SlimSurface, frame_of_normals
 from ..surface.surfel import SurfelHierarchy
 
-MEASURED = SlimSurface | PatchSurface | SurfelHierarchy | ScaleMap
+MEASURED = SlimSurface | StoredSurface | PatchSurface | SurfelHierarchy | ScaleMap
 ALPHA = 2 / 3  # of a ball's radius: the part that carries the surface
 
 
@@ -96,7 +97,7 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
 
     Parameters
     ----------
-    surface : SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh or Placed
+    surface : SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh or Placed
         SLIM surfaces and hierarchies are projected onto (see `project`); of patches, the triangles between opaque nodes
         count, of scale maps those between valid texels.
     scan : Mesh, PointCloud, RangeScan, (n, 3) array_like of world positions, or the path of a scan
@@ -118,8 +119,8 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
     """
     scan = _as_scan(scan)
     if not isinstance(surface.surface if isinstance(surface, Placed) else surface, MEASURED | Mesh):
-        raise InputError("surface: expected a SlimSurface, a PatchSurface, a SurfelHierarchy, a ScaleMap or a Mesh, "
-                         f"got {type(surface).__name__}")
+        raise InputError("surface: expected a SlimSurface, a StoredSurface, a PatchSurface, a SurfelHierarchy, a "
+                         f"ScaleMap or a Mesh, got {type(surface).__name__}")
     if both and not (isinstance(scan, Mesh) and len(scan.faces)):
         raise InputError("both: expected a scan with faces to measure the surface's points against, got points only")
     device = open_device(device)
@@ -160,7 +161,7 @@ def distances(surface, points: NDArray, device) -> NDArray:
     if isinstance(surface, Placed):
         linear, scale = surface.matrix[:3, :3], surface.scale
         return scale * distances(surface.surface, (points - surface.matrix[:3, 3]) @ linear / scale**2, device)
-    if isinstance(surface, SlimSurface | SurfelHierarchy):
+    if isinstance(surface, SlimSurface | StoredSurface | SurfelHierarchy):
         return project(surface, points, device=device).distance
     mesh = _as_mesh(surface)
     return triangle_distances(mesh.vertices, mesh.faces, points - mesh.origin, device)
@@ -185,6 +186,8 @@ def surface_samples(surface, count: int, device) -> NDArray:
     random = np.random.default_rng(0)
     if isinstance(surface, SlimSurface):
         return project(surface, _disc_points(surface, count, random), device=device).position
+    if isinstance(surface, StoredSurface):
+        return project(surface, _stored_points(surface, count, random), device=device).position
     if isinstance(surface, SurfelHierarchy) and not surface.hybrid:
         return project(surface, _base_points(surface, count, random), device=device).position
     mesh = _as_mesh(surface)
@@ -211,6 +214,15 @@ def _base_points(surface: SurfelHierarchy, count: int, random) -> NDArray:
     u, v = frame_of_normals(surface.normals[chosen].astype(np.float64))
     return (surface.positions[chosen] + (reach * np.cos(angle))[:, None] * u + (reach * np.sin(angle))[:, None] * v
             + surface.origin)
+
+
+def _stored_points(stored: StoredSurface, count: int, random) -> NDArray:
+    """Return random world points (n, 3) of the discs of a surface in its store, part by part."""
+    leaves = stored.leaves()
+    area = np.array([(leaves.leaves(part)[0].radii.astype(np.float64) ** 2).sum() for part in range(len(leaves))])
+    counts = random.multinomial(count, area / area.sum())
+    return np.concatenate([_disc_points(leaves.leaves(part)[0], int(counts[part]), random)
+                           for part in np.flatnonzero(counts)])
 
 
 def _disc_points(surface: SlimSurface, count: int, random) -> NDArray:

@@ -8,12 +8,18 @@ from numpy.typing import NDArray
 from ..device import Device, open_device
 from ..device.arrays import DeviceArray
 from ..errors import InputError
+from ..io.stored import StoredSurface
+from ..surface.mesh import Mesh
+from ..surface.patch import PatchSurface
+from ..surface.patch_mesh import patch_mesh
 from ..surface.placed import Placed
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface, frame_of_normals
 from ..surface.surfel import SurfelHierarchy
 from .point_tree import BLOCK, build_boxes, column_bounds, morton_order
+from .project_mesh import project_mesh
 from .project_scale_map import project_scale_map
+from .project_stored import project_stored
 from .project_surfels import project_surfels
 
 LEAF = 24  # floats a leaf (project_points.cl)
@@ -63,8 +69,10 @@ def project(surface, points, device=None) -> Projection:
 
     Parameters
     ----------
-    surface : SlimSurface, SurfelHierarchy, ScaleMap or Placed
-        A SLIM surface's leaves are used; of a hierarchy the base surfels, blended, or the triangles.
+    surface : SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh or Placed
+        A SLIM surface's leaves are used; of a hierarchy the base surfels, blended, or the triangles; of patches the
+        triangles between their opaque nodes. Of a StoredSurface the parts around the points are read, within its
+        budget.
     points : (n, 3) array_like
         World positions, float64.
     device : None, str or Device
@@ -73,7 +81,8 @@ def project(surface, points, device=None) -> Projection:
     -------
     Projection
         Points far from the surface (against its radius of curvature) get a near point, not always the nearest. On a
-        scale map the nearest point to second order in the texels' size; normals point outward.
+        scale map the nearest point to second order in the texels' size; normals point outward. On triangles the nearest
+        point, and the sign of the distance is right at edges and vertices too.
 
     Raises
     ------
@@ -94,13 +103,19 @@ def project(surface, points, device=None) -> Projection:
         near = project(surface.surface, local, device)
         return Projection(near.position @ linear.T + surface.matrix[:3, 3], near.normal @ linear.T / scale,
                           near.distance * scale)
+    if isinstance(surface, StoredSurface):
+        return Projection(*project_stored(surface, points, open_device(device)))
     if isinstance(surface, SurfelHierarchy):
         return Projection(*project_surfels(surface, points, open_device(device)))
     if isinstance(surface, ScaleMap):
         return Projection(*project_scale_map(surface, points, open_device(device)))
+    if isinstance(surface, PatchSurface):
+        surface = patch_mesh(surface)
+    if isinstance(surface, Mesh):
+        return Projection(*project_mesh(surface, points, open_device(device)))
     if not isinstance(surface, SlimSurface):
-        raise InputError("surface: expected a SlimSurface, a SurfelHierarchy or a ScaleMap, got "
-                         f"{type(surface).__name__}")
+        raise InputError("surface: expected a SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap or "
+                         f"Mesh, or one of these placed, got {type(surface).__name__}")
     device = open_device(device)
     tree = leaf_tree(surface, device)
     shift = surface.origin + tree.middle

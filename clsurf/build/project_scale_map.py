@@ -9,7 +9,7 @@ from ..surface.cube import interpolated
 from ..surface.scale_map import ScaleMap
 from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import frame_of_normals
-from .triangles import nearest_triangles
+from .triangles import closest_on_triangles, nearest_triangles
 
 
 def project_scale_map(surface: ScaleMap, points: NDArray, device: Device) -> tuple[NDArray, NDArray, NDArray]:
@@ -41,27 +41,6 @@ def project_scale_map(surface: ScaleMap, points: NDArray, device: Device) -> tup
     apart = local - position
     side = np.where((apart * normal).sum(axis=1) < 0, -1.0, 1.0)
     return position + surface.center, normal, side * np.linalg.norm(apart, axis=1)
-
-
-def closest_on_triangles(points: NDArray, corners: NDArray) -> NDArray:
-    """Return the nearest points (n, 3) of triangles (n, 3 corners, 3) to points (n, 3), float64."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    e, f, d = b - a, c - a, points - a
-    dot = lambda x, y: np.einsum("ij,ij->i", x, y)  # noqa: E731
-    ee, ff, ef, de, df = dot(e, e), dot(f, f), dot(e, f), dot(d, e), dot(d, f)
-    determinant = ee * ff - ef * ef
-    safe = lambda x: np.where(x > 0, x, 1)  # noqa: E731
-    v, w = (ff * de - ef * df) / safe(determinant), (ee * df - ef * de) / safe(determinant)
-    inside = (determinant > 1e-14 * ee * ff) & (v >= 0) & (w >= 0) & (v + w <= 1)
-    found = [a + np.where(inside, v, 0)[:, None] * e + np.where(inside, w, 0)[:, None] * f]
-    for p, q in ((a, b), (b, c), (c, a)):
-        edge = q - p
-        t = np.clip(dot(points - p, edge) / safe(dot(edge, edge)), 0, 1)
-        found.append(p + t[:, None] * edge)
-    found = np.stack(found)
-    gap = ((found - points) ** 2).sum(axis=2)
-    gap[0, inside] = -1
-    return found[gap.argmin(axis=0), np.arange(len(points))]
 
 
 def _radius(surface, layer, directions) -> tuple[NDArray, NDArray]:

@@ -9,15 +9,8 @@ from scipy import ndimage
 
 from .point_tree import BLOCK, PointTree, column_bounds
 
-GOLDEN = (math.sqrt(5) - 1) / 2
-FIRST_RADIUS = 0.1  # r_0 over the diagonal (paper, section 2)
 SAMPLES = 24_000  # points whose neighbours give lambda; fewer than 20 thousand scatter by several percent
 LEAST_PENALTY = 1e-15  # of lambda T^2 over diagonal^4: above the rounding of e^2, so that exact data falls monotonously
-
-
-def segment_end(level: int) -> float:
-    """Return r_r of the segment of `level` (1 the coarsest), over the diagonal."""
-    return FIRST_RADIUS * GOLDEN ** (level - 1)
 
 
 def robust_box(points: NDArray) -> NDArray:

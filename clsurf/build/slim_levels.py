@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..device.arrays import DeviceArray
-from ..surface.slim import COEFFICIENTS, SlimSurface
+from ..surface.slim import COEFFICIENTS, SlimSurface, segment_end
 from ..surface.srgb import premultiplied, straight
 from .point_tree import BLOCK, FAR_POINT, PointTree
 from .project import leaf_tree, project_sorted
-from .radius import Noise, segment_end
+from .radius import Noise
 
 GAMMA = 0.1  # overlap that every point must have (paper: 0.1)
 OVERLAP_ONE = 1 << 20  # fixed point of the overlap sums (cover_points.cl)
@@ -55,7 +55,7 @@ class Level:
 
 def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, report,
                  fixed_radius: float | None = None, tolerance: float = math.inf, levels: range = ALL_LEVELS,
-                 overlap: DeviceArray | None = None) -> list[Level]:
+                 overlap: DeviceArray | None = None, away: NDArray | None = None) -> list[Level]:
     """Cover the points level by level until every point is covered by leaves.
 
     Parameters
@@ -72,6 +72,9 @@ def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, rep
         Those to make; without the last one of all, points may stay uncovered.
     overlap : DeviceArray, optional
         (padded,) uint32, the coverage so far (cover_points.cl); the leaves' is added.
+    away : (count,) float32, optional
+        Of the sorted points: at least so far from those that must be covered, over the diagonal. Points that a level's
+        balls do not reach from there are fitted to, but get no surfels of their own.
     """
     device = tree.device
     terms = (degree + 1) * (degree + 2) // 2
@@ -90,6 +93,8 @@ def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, rep
         r_r = fixed_radius or segment_end(number)
         mode = FIXED if fixed_radius else FORCED if number == LEVELS else SEGMENT
         device.fill(held, 0)
+        if away is not None:
+            leave_out(device, overlap, away > r_r)
         centers, records = [], []
         while True:
             mark_open((blocks,), (16,), tree.count, blocks, COVERED, overlap, held, state)
@@ -117,6 +122,14 @@ def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, rep
         covered = np.count_nonzero(device.download(overlap, copy=False)[:tree.count] >= COVERED)
         report("levels", covered / tree.count)
     return made
+
+
+def leave_out(device, overlap: DeviceArray, rows: NDArray) -> None:
+    """Count sorted points (count,) bool as covered: no surfels are made for them."""
+    if rows.any():
+        values = device.download(overlap)
+        values[:len(rows)][rows] = np.maximum(values[:len(rows)][rows], COVERED)
+        device.write(overlap, values)
 
 
 def link_levels(levels: list[Level], position: list[NDArray]) -> tuple[NDArray, NDArray]:

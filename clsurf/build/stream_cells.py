@@ -131,6 +131,7 @@ class CellPoints:
     colors: NDArray | None
     normals: NDArray | None  # as the file has them
     own: NDArray  # (n,) bool: not of the halo
+    away: NDArray  # (n,) float32: at least so far from the cell's own points, world units
     origin: NDArray  # (3,) float64, world
 
     def near(self, surface: SlimSurface) -> NDArray:
@@ -144,16 +145,18 @@ class CellPoints:
 def cell_points(runs: Runs, plan: Plan, number: int, halo: bool = True) -> CellPoints:
     """Return the distinct points of a cell, with its halo or without."""
     first, last = plan.cuts[number:number + 2]
-    wanted = halo_of(runs, first, last, plan.rings) if halo else np.arange(first, last)
+    wanted, ring = halo_of(runs, first, last, plan.rings if halo else 0)
     origin = cell_middle(runs, first, last)
     points = runs.fetch(wanted, origin)
-    own = ((wanted >= first) & (wanted < last))[points.cell]
+    own = (ring == 0)[points.cell]
+    away = (np.maximum(ring - 1, 0) * np.float32(runs.lattice.width))[points.cell]
     if halo:
         kept, _ = first_of_duplicates(points.position)
         if len(kept) < len(own):
             take = lambda array: None if array is None else array[kept]  # noqa: E731
-            return CellPoints(points.position[kept], take(points.colors), take(points.normals), own[kept], origin)
-    return CellPoints(points.position, points.colors, points.normals, own, origin)
+            return CellPoints(points.position[kept], take(points.colors), take(points.normals), own[kept], away[kept],
+                              origin)
+    return CellPoints(points.position, points.colors, points.normals, own, away, origin)
 
 
 def check_cell(points: CellPoints, plan: Plan, coarse: Coarse, device: Device) -> tuple[NDArray, NDArray]:
@@ -225,7 +228,8 @@ def build_cell(points: CellPoints, plan: Plan, options: Options, coarse: Coarse,
     overlap = covered_by(tree, place, record, tolerance, options.degree)
     before = device.download(overlap)
     levels = build_levels(tree, options.degree, penalty_of(plan), plan.noise, lambda *_: None, tolerance=tolerance,
-                          levels=range(plan.first, 26), overlap=overlap)
+                          levels=range(plan.first, 26), overlap=overlap,
+                          away=points.away[tree.order] / np.float32(plan.diagonal))
     levels = kept_levels(tree, levels, points.own[tree.order], device.upload(before), tolerance, options.degree)
     usable = Points(points.position, normals, points.colors, None)
     surface = assemble(levels, usable, tree, options.degree, plan.error, plan.diagonal, points.origin)

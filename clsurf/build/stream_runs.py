@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
+from ..device.arrays import give_back
 from ..io.chunks import Chunk, Source
 from ..io.colors import as_rgba8
 from ..io.files import write_array
@@ -22,6 +23,7 @@ from .neighbours import box_tree, sampled_covariance
 
 FINE = 4.0  # width of a fine cell, point spacings
 AXIS_BITS = 21  # of a fine cell's coordinate
+BLOCK_BITS = 5  # blocks of 32 fine cells across are looked through together
 THINNED = 16  # every 16th point stands for the others at coarse levels: twice the spacing twice over
 _SAMPLES = 20_000
 
@@ -194,21 +196,41 @@ class Runs:
     def __init__(self, folder: Path, lattice: Lattice):
         self.folder, self.lattice = folder, lattice
         self.names = sorted(path.stem for path in folder.glob("*.cells"))
-        self._cells, self._starts, about = [], [], []
+        each, self._starts, about = [], [], []
         for name in self.names:
             cells, counts = np.fromfile(folder / f"{name}.cells", np.uint64).reshape(2, -1)
-            self._cells.append(cells)
-            self._starts.append(np.concatenate([[0], np.cumsum(counts.astype(np.int64))]))
+            each.append(cells)
+            self._starts.append(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
             about.append(json.loads((folder / f"{name}.json").read_bytes()))
         self.most = max((one["most"] for one in about), default=0.0)
         self.whole = all(one["whole"] for one in about)
-        self.cells = np.unique(np.concatenate(self._cells)) if self._cells else np.zeros(0, np.uint64)
+        every = np.concatenate([np.zeros(0, np.uint64), *each])
+        every.sort()
+        self.cells = runs_of(every)[0]
+        del every
         self.counts = np.zeros(len(self.cells), np.int64)
-        self._place = []
-        for cells, starts in zip(self._cells, self._starts, strict=True):
-            place = np.searchsorted(self.cells, cells)
+        self._place = []  # of a run's cells among all
+        for number, starts in enumerate(self._starts):
+            place = np.searchsorted(self.cells, each[number])
+            each[number] = None
             self.counts[place] += np.diff(starts)
             self._place.append(place.astype(np.int32))
+        give_back()
+        self._blocks, lengths = runs_of(self.cells >> np.uint64(3 * BLOCK_BITS))
+        self._block_first = np.concatenate([[0], np.cumsum(lengths)])
+
+    def inside(self, low: NDArray, high: NDArray) -> NDArray:
+        """Return the ascending indices of the fine cells with coordinates (3,) from `low` to `high`, both included.
+
+        Only blocks of cells that the box touches are looked at: a survey has millions of cells, and every part of it
+        asks for its own surroundings.
+        """
+        block = unmorton(self._blocks)
+        near = ((block >= low >> BLOCK_BITS) & (block <= high >> BLOCK_BITS)).all(axis=1)
+        ranges = zip(self._block_first[:-1][near], self._block_first[1:][near], strict=True)
+        found = np.concatenate([np.zeros(0, np.int64), *(np.arange(a, b) for a, b in ranges)])
+        cell = unmorton(self.cells[found])
+        return found[((cell >= low) & (cell <= high)).all(axis=1)]
 
     def fetch(self, wanted: NDArray, origin: NDArray) -> Points:
         """Return the points of the fine cells `wanted`, ascending indices of `cells`, run by run.
@@ -218,19 +240,21 @@ class Runs:
         origin : (3,) float64
             World position that the points are to be relative to.
         """
-        rank = np.full(len(self.cells), -1, np.int32)
-        rank[wanted] = np.arange(len(wanted), dtype=np.int32)
         dtype = self.lattice.record
         record = np.empty(int(self.counts[wanted].sum()), dtype)
         owner = np.empty(len(record), np.int32)
+        begin = np.flatnonzero(np.diff(wanted, prepend=-2) != 1)  # where ranges of consecutive cells begin
+        low, high = wanted[begin], wanted[np.append(begin[1:], len(wanted)) - 1]
         at = 0
         for name, place, starts in zip(self.names, self._place, self._starts, strict=True):
-            rows = np.flatnonzero(rank[place] >= 0)
-            if not len(rows):
+            first, last = np.searchsorted(place, low), np.searchsorted(place, high, side="right")
+            some = np.flatnonzero(first < last)
+            if not len(some):
                 continue
+            rows = np.concatenate([np.arange(a, b) for a, b in zip(first[some], last[some], strict=True)])
             counts = starts[rows + 1] - starts[rows]
-            owner[at:at + counts.sum()] = np.repeat(rank[place[rows]], counts)
-            first = np.flatnonzero(np.concatenate([[True], rows[1:] != rows[:-1] + 1]))
+            owner[at:at + counts.sum()] = np.repeat(np.searchsorted(wanted, place[rows]), counts)
+            first = np.flatnonzero(np.diff(rows, prepend=-2) != 1)
             last = np.append(first[1:], len(rows)) - 1
             with open(self.folder / f"{name}.points", "rb", buffering=0) as file:
                 for begin, end in zip(starts[rows[first]].tolist(), starts[rows[last] + 1].tolist(), strict=True):
@@ -240,10 +264,9 @@ class Runs:
 
     def thin(self, step: int, origin: NDArray) -> Points:
         """Return every step-th of the thinned points."""
-        record = np.concatenate([np.fromfile(self.folder / f"{name}.thin", self.lattice.record)[::step]
-                                 for name in self.names])
-        keys = np.concatenate([np.fromfile(self.folder / f"{name}.thin_cells", np.uint64)[::step]
-                               for name in self.names])
+        every = lambda ending, dtype: np.concatenate([  # noqa: E731  copies: the rest of a file need not stay
+            np.fromfile(self.folder / f"{name}.{ending}", dtype)[::step].copy() for name in self.names])
+        record, keys = every("thin", self.lattice.record), every("thin_cells", np.uint64)
         cells, owner = np.unique(keys, return_inverse=True)
         return self._points(record, cells, owner.ravel(), origin)
 

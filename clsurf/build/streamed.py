@@ -5,12 +5,10 @@ NAME.part and adds files that appear whole. So a build that was killed goes on w
 run anywhere: their arguments are numbers (see `distributed`).
 """
 
-import contextlib
 import json
 import logging
 import os
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, astuple
 from pathlib import Path
 
@@ -29,6 +27,7 @@ from .patches import PatchRequest
 from .radius import Noise, automatic_error
 from .slim_levels import BOUND_SHARE, LEVELS
 from .stream_cells import (
+    CellPoints,
     Coarse,
     Options,
     build_cell,
@@ -37,6 +36,7 @@ from .stream_cells import (
     check_cell,
     checked,
 )
+from .stream_here import Here
 from .stream_patches import no_patches
 from .stream_plan import LARGEST, Plan, box_of, cut_cells, first_fine_level, measure, thinning
 from .stream_runs import THINNED, Lattice, Runs, chunk_written, lattice_of, make_run, write_whole
@@ -105,12 +105,13 @@ class Build:
         count = int(runs.counts.sum())
         if not count:
             raise InputError(f"{self.source_path}: expected points, got none that are finite")
-        origin, diagonal = box_of(runs)
+        thin = thinning(count, self.sizes.thin)
+        origin, diagonal = box_of(runs, thin // THINNED)
         if not diagonal > 0:
             raise InputError("scan: expected points with some extent, got all of them at one place")
         noise, neighbours = measure(runs, diagonal, self.device)
         error = automatic_error(noise) if self.options.error == "auto" else float(self.options.error)
-        thin, spacing, width = thinning(count, self.sizes.thin), noise.spacing * diagonal, runs.lattice.width
+        spacing, width = noise.spacing * diagonal, runs.lattice.width
         rings = int(np.ceil(2 * LARGEST * np.sqrt(thin / THINNED) * spacing / width))
         cuts = cut_cells(runs.cells, runs.counts, with_halo(self.sizes.cell, rings * width / max(spacing, 1e-300)))
         first = 1 if len(cuts) == 2 or self.options.patches is not None else first_fine_level(noise.spacing, thin)
@@ -183,16 +184,22 @@ class Build:
         """Return whether cell `number` is there."""
         return part_folder(self.folder, number + 1).exists()
 
-    def build(self, number: int, points=None) -> None:
+    def build(self, number: int) -> None:
         """Build cell `number` and write it as part number + 1."""
         if self.cell_written(number):
             return
-        points = cell_points(self.runs, self.plan, number) if points is None else points
+        self.write(number, *self.cell(cell_points(self.runs, self.plan, number)))
+        give_back()
+
+    def cell(self, points: CellPoints) -> tuple:
+        """Return a cell's surface and what is to be known of its distances (`build_cell`)."""
         total = int(self.runs.counts.sum())
-        surface, distance = build_cell(points, self.plan, self.options, self._checked_coarse(), self.device, total)
+        return build_cell(points, self.plan, self.options, self._checked_coarse(), self.device, total)
+
+    def write(self, number: int, surface, distance: NDArray) -> None:
+        """Write what `cell` returned for cell `number`."""
         self._describe(number + 1, surface, distance)
         write_part(self.folder, number + 1, surface)
-        give_back()
 
     def finish(self, out: Path) -> None:
         """Write the index, drop what only the build needed, and give the folder its name."""
@@ -324,7 +331,7 @@ def _streamed(path, out, degree, error, tolerance, memory_limit, report, device,
                       None if patches is None else astuple(patches))
     build = begin(path, out, options, sizes, device)
     kept = device.keep(sizes.cell * KEPT_PER_POINT)
-    steps = _Here(build, source) if scheduler is None else _cluster(scheduler, build, name)
+    steps = Here(build, source) if scheduler is None else _cluster(scheduler, build, name)
     try:
         report("read", 0.0)
         build.make_lattice(source)
@@ -351,59 +358,3 @@ def _cluster(scheduler, build: Build, device: str | None):
 
 def _orient(source: Source) -> str:
     return "up" if source.airborne else "graph"
-
-
-class _Here:
-    """The steps one after the other in this process, with one thread that reads ahead."""
-
-    def __init__(self, build: Build, source: Source):
-        self.build, self.source = build, source
-
-    def close(self) -> None:
-        """Do nothing: no workers were started."""
-
-    def runs(self, numbers, report) -> None:
-        """Write the runs that are missing."""
-        folder, lattice = self.build.work / "runs", self.build.lattice()
-        missing = [number for number in numbers if not self.build.run_written(number)]
-        for done, (number, chunk) in enumerate(_ahead(missing, self.source.read)):
-            make_run(folder, number, self.source, lattice, chunk)
-            give_back()
-            report("read", (done + 1) / len(missing))
-
-    def checks(self, numbers, report) -> None:
-        """Check the coarse leaves against every cell."""
-        build = self.build
-        missing = [number for number in numbers if not build.check_written(number)]
-        for done, (number, points) in enumerate(_ahead(
-                missing, lambda number: cell_points(build.runs, build.plan, number, halo=False))):
-            build.check(number, points)
-            report("check", (done + 1) / len(missing))
-
-    def cells(self, numbers, report) -> None:
-        """Build the cells that are missing."""
-        build = self.build
-        missing = [number for number in numbers if not build.cell_written(number)]
-        for done, (number, points) in enumerate(_ahead(
-                missing, lambda number: cell_points(build.runs, build.plan, number))):
-            build.build(number, points)
-            report("cells", (done + 1) / (len(missing) + 1))
-
-
-def _ahead(numbers, read):
-    """Yield (number, read(number)), the next one being read meanwhile."""
-    with ThreadPoolExecutor(1) as pool:
-        waiting = [pool.submit(read, number) for number in numbers[:1]]
-        try:
-            for place, number in enumerate(numbers):
-                result = waiting.pop().result()
-                if place + 1 < len(numbers):
-                    waiting.append(pool.submit(read, numbers[place + 1]))
-                yield number, result
-                del result
-        finally:
-            for future in waiting:
-                future.cancel()
-                with contextlib.suppress(Exception):
-                    future.result()
-

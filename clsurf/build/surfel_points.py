@@ -13,7 +13,9 @@ from .large_faces import LARGE, longest2
 from .neighbours import nearest
 from .slim import usable_points
 
-NEIGHBOURS = 16  # of a point, itself among them (kernels/build/surfel_radii.cl)
+# Of a point, itself among them (kernels/build/surfel_radii.cl). In scattered clouds 16 may lie on one side, which then
+# passes for a rim: 15 places of a million were holes.
+NEIGHBOURS = 24
 # Radii over the reach of a point's Voronoi cell. At 1.5 a place lies in 3.5 discs on average, and what is seen of them
 # is their inner 0.85, which still leaves no hole (kernels/render/tile_surfels.cl).
 OVERLAP = 1.5

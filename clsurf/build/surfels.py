@@ -6,7 +6,6 @@ Source: Holst, Schumann, "Normal Mapping for Surfel-Based Rendering", Journal of
 import os
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..device import open_device
 from ..errors import Cancelled, DeviceMemoryError, InputError
@@ -17,12 +16,11 @@ from ..surface.ranges import RangeScan
 from ..surface.srgb import straight
 from ..surface.surfel import SurfelHierarchy
 from .slim import face_normals, parse_bytes, vertex_colors
+from .surfel_bound import BOUND_SHARE, bound_of
 from .surfel_maps import LARGEST_MAP, draw_maps, light_of
-from .surfel_points import Base, base_surfels, unit
+from .surfel_points import base_surfels, unit
 from .surfel_tree import Tree, cluster, discs_of
 
-BOUND_SHARE = 0.999  # of the scan's points lie within `bound` of the finest level
-BOUND_SAMPLES = 1 << 16
 BYTES_PER_POINT = 400  # of a build's memory beyond the scan and the maps
 
 
@@ -52,7 +50,7 @@ def build_surfels(scan, spacing=None, map_size=16, hybrid=False, memory_limit=No
     Returns
     -------
     SurfelHierarchy
-        `bound` holds for `bound_share` of the scan's points. The same input gives the same bytes on one device.
+        `bound` holds for `bound_share` of the scan. The same input gives the same bytes on one device.
 
     Raises
     ------
@@ -133,8 +131,7 @@ def pure_parts(scan, spacing, device, report) -> tuple[dict, int]:
         heights=join(discs.heights, np.zeros(n)), spreads=join(discs.spreads, np.zeros(n)),
         level=np.concatenate([tree.level, np.full(n, tree.level.max() + 1)]), child_offset=child_offset,
         children=children, lights=lights, colors=None if lights is None else straight(lights.astype(np.float64)),
-        spacing=base.spacing, bound=0.0 if spacing is None else bound_of(scan, base),
-        bound_share=1.0 if spacing is None else BOUND_SHARE), inner
+        spacing=base.spacing, bound=bound_of(scan, base, device), bound_share=BOUND_SHARE), inner
 
 
 def widened(spheres):
@@ -151,17 +148,6 @@ def tree_links(tree: Tree, elements: int):
     child_offset = np.concatenate([[0], np.cumsum(count)])
     children = np.repeat(first - child_offset[:inner], count[:inner]) + np.arange(child_offset[-1])
     return child_offset.astype(np.int32), children.astype(np.int32)
-
-
-def bound_of(scan, base: Base) -> float:
-    """Return the distance to the nearest disc that BOUND_SHARE of the scan's points keep, from an even sample."""
-    points = scan.points[np.isfinite(scan.points).all(axis=1)]
-    points = points[::max(1, len(points) // BOUND_SAMPLES)].astype(np.float64)
-    _, near = cKDTree(base.positions).query(points)
-    d = points - base.positions[near]
-    away = np.abs(np.einsum("ij,ij->i", d, base.normals[near].astype(np.float64)))
-    beyond = np.maximum(np.sqrt(np.maximum((d**2).sum(axis=1) - away**2, 0)) - base.radii[near], 0)
-    return float(np.quantile(np.hypot(away, beyond), BOUND_SHARE))
 
 
 def hybrid_parts(mesh: Mesh, spacing, device, report) -> tuple[dict, int]:

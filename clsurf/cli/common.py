@@ -60,7 +60,8 @@ class Steps:
 def is_surface(thing) -> bool:
     """Return whether `thing` is a surface, and not a scan that one is built from."""
     import clsurf
-    return isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.SurfelHierarchy | clsurf.ScaleMap)
+    return isinstance(thing, clsurf.SlimSurface | clsurf.PatchSurface | clsurf.SurfelHierarchy | clsurf.ScaleMap |
+                      clsurf.StoredSurface)
 
 
 def checked_out(path: Path, endings=()) -> Path:

@@ -18,6 +18,8 @@ FramesOption = Annotated[int | None, typer.Option(help="--path: number of frames
 FpsOption = Annotated[float, typer.Option(help="Frames a second of a moving picture.")]
 CameraOption = Annotated[str, typer.Option("--camera", help="Camera of such a file, FILE or FILE:NAME; the first by "
                                            "default.")]
+SchedulerOption = Annotated[str, typer.Option(help="--turntable, --path: have the frames drawn by the workers of a "
+                                              "Dask scheduler, tcp://host:8786 or local; they see the same files.")]
 IgnoreOption = Annotated[bool, typer.Option("--ignore-distortion", help="Use cameras whose lens bends straight lines, "
                                             "as if it did not.")]
 
@@ -56,21 +58,21 @@ class Motion:
         return [first.orbited(target, 360 * i / self.turntable, view.up) for i in range(self.turntable)]
 
     def write(self, out: Path, draw, thing, view, size: tuple[int, int], steps: Steps) -> None:
-        """Draw a frame for every camera with `draw`, and write them as they come."""
+        """Write the frames that `draw` gives for the cameras, as they come."""
         from ..io.video import write_video
         cameras = self.cameras(thing, view, size)
 
         def frames():
-            for number, camera in enumerate(cameras):
-                steps.progress("draw", number / len(cameras))
-                yield draw(camera)
+            for number, frame in enumerate(draw(cameras)):
+                yield frame
+                steps.progress("draw", (number + 1) / len(cameras))
         with steps.step("draw"):
             count = write_video(out, frames(), self.fps)
         steps.say(f"  {count} frames, {count / self.fps:.3g} s")
 
 
 def motion(out: Path, turntable: int | None, path: Path | None, frames: int | None, fps: float, camera: str,
-           ignore_distortion: bool, view_given: bool) -> Motion:
+           ignore_distortion: bool, view_given: bool, scheduler: str = "") -> Motion:
     """Return the options of moving pictures, or raise InputError.
 
     `view_given`: whether an option says where the picture is seen from.
@@ -87,6 +89,8 @@ def motion(out: Path, turntable: int | None, path: Path | None, frames: int | No
         if value is not None and value < 1:
             raise InputError(f"{name}: expected at least 1 frame, got {value}")
     checked_fps(out, fps)
+    if scheduler and turntable is None and path is None:
+        raise InputError("scheduler: expected --turntable or --path beside it: one picture is drawn here")
     lens = "ignore" if ignore_distortion else "refuse"
     if turntable is None and path is None:
         return Motion(None, None, 0, fps, camera_of(camera, lens) if camera else None)

@@ -17,9 +17,9 @@ from .common import (
     SizeOption,
     Steps,
     checked_out,
-    is_surface,
     parsed_size,
 )
+from .drawing import Drawing, write_moving
 from .lights import LightOption, MaterialOption, MirrorOption, OcclusionOption, ShadowsOption, SkyOption, lighting
 from .line_pictures import LinesOption, OnWhiteOption, endings, line_picture
 from .motion import (
@@ -28,25 +28,33 @@ from .motion import (
     FramesOption,
     IgnoreOption,
     PathOption,
+    SchedulerOption,
     TurntableOption,
     motion,
 )
 from .output import AntialiasOption, BackgroundOption, BitsOption, ExposureOption, ToneOption, output
 from .raw_scans import AsOption, AttributeOption, EyeDomeOption, PointSizeOption, point_drawing, wants_scan
+from .recipe import BitsOption as MapBitsOption
 from .recipe import (
+    CenterOption,
     DegreeOption,
     ErrorOption,
+    HitOption,
     HybridOption,
     KindOption,
+    LayersOption,
     MapSizeOption,
     PatchesOption,
-    Recipe,
     SpacingOption,
+    TexelsOption,
     parsed_error,
     recipe,
+    with_scale_map,
 )
+from .sources import loaded_surface, surface_in
 
-SourceArgument = Annotated[Path, typer.Argument(help="A surface, or a scan (its surface is then built first).")]
+SourceArgument = Annotated[str, typer.Argument(help="A surface, or a scan (its surface is then built first), or the "
+                                               "address of a streamed surface.")]
 LodOption = Annotated[float, typer.Option(help="slim: projected diameter in pixels below which coarser surfels serve; "
                                           "8 is the fast mode, 0 draws leaves only; surfels: the same near "
                                           "silhouettes.")]
@@ -61,6 +69,8 @@ FormOption = Annotated[str, typer.Option(help="scale_map: cast (rays of pixels) 
 FacesOption = Annotated[int, typer.Option(help="scale_map: subdivisions of the geosphere, 0 to 9; 6: 81,920 "
                                           "triangles.")]
 MapNormalsOption = Annotated[str, typer.Option(help="scale_map: auto, stored, neighbours or gradient.")]
+StoredNormalsOption = Annotated[bool, typer.Option("--stored-normals", help="scale_map: build it with the model's "
+                                                   "normals.")]
 SamplesOption = Annotated[int, typer.Option(help="Samples along each side of a pixel, 1 to 4.")]
 LookOption = Annotated[str, typer.Option(help="phong, physical, matcap, normal, flat, reflection (lines); slim: "
                                               "ball_size, ball_level.")]
@@ -107,6 +117,7 @@ def render(source: SourceArgument,
            fov: FovOption = None, eye: EyeOption = "", target: TargetOption = "", ortho: OrthoOption = None,
            turntable: TurntableOption = None, path: PathOption = None, frames: FramesOption = None,
            fps: FpsOption = 30.0, camera: CameraOption = "", ignore_distortion: IgnoreOption = False,
+           scheduler: SchedulerOption = "",
            channels: Annotated[str, typer.Option(help="From color,depth,normal,position,level,count,cost,id, and "
                                                       "those of --channel; .png and .jpg show "
                                                       "color.")] = "color,depth,normal",
@@ -132,7 +143,9 @@ def render(source: SourceArgument,
     from ..render.renderer import checked_channels, checked_lod, checked_size
     # Every option is checked before the work.
     seen_from = direction or eye or target or (fov, ortho) != (None, None)
-    moving = motion(out, turntable, path, frames, fps, camera, ignore_distortion, bool(seen_from))
+    moving = motion(out, turntable, path, frames, fps, camera, ignore_distortion, bool(seen_from), scheduler)
+    if scheduler and profile:
+        raise InputError("--profile: expected no --scheduler beside it: the workers draw")
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size) if size else moving.size)
     wanted = checked_channels(filter(None, channels.split(",")))
     strokes, colored = line_picture(lines, on_white), channel_picture(channel, legend, limit, lines, out)
@@ -145,7 +158,7 @@ def render(source: SourceArgument,
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
     surfels = clsurf.SurfelDrawing(interior, not no_maps)
     lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
-    lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    lod, patch_drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
     written = output(out, background, antialias, supersampling, tone, exposure, bits, lines, channel, moving.moves)
     if written.background == "sky" and not sky:
@@ -153,35 +166,34 @@ def render(source: SourceArgument,
     as_it_is, points = wants_scan(drawn_as, lines, channel, kind), point_drawing(point_size, eye_dome, attribute)
     if colored:
         colored.prepared(how, degree)
-    chosen = clsurf.open_device(device or None)
-    if strokes:
-        thing, coarse = strokes.surfaces(source, how, chosen, steps)
-        wanted = strokes.channels(wanted, coarse is thing)
+    # Workers have devices of their own.
+    chosen = device or None if scheduler else clsurf.open_device(device or None)
+    coarse = None
+    if scheduler:
+        thing = surface_in(source, as_it_is, steps)
+        wanted = strokes.channels(wanted, True) if strokes else wanted
+    elif strokes:
+        thing, found_on = strokes.surfaces(source, how, chosen, steps)
+        coarse = None if found_on is thing else found_on
+        wanted = strokes.channels(wanted, coarse is None)
     else:
         thing = loaded_surface(source, how, chosen, steps, as_it_is)
-
-    def drawn(seen):
-        if colored:
-            return colored.draw(thing, seen, picture_size, lit.shading, lod, supersampling, drawing, chosen)
-        frame = clsurf.render(lit.scene(thing, seen), seen, picture_size, wanted, lit.shading, lod,
-                              written.background, chosen, supersampling=supersampling, patches=drawing,
-                              surfels=surfels, scale_map=scale_map, points=points, antialias=written.antialias)
-        if not strokes or not moving.moves:
-            return frame
-        return strokes.over(frame, None if coarse is thing else coarse, seen, picture_size, chosen)
-
-    chosen.profile = Profile() if profile else None
+    drawing = Drawing(lit, written, wanted, lod, {
+        "supersampling": supersampling, "patches": patch_drawing, "surfels": surfels, "scale_map": scale_map,
+        "points": points}, colored, strokes, coarse)
+    if not scheduler:
+        chosen.profile = Profile() if profile else None
     if moving.moves:
-        moving.write(out, lambda seen: written.shown(drawn(seen)), thing, view, picture_size, steps)
+        write_moving(out, moving, drawing, source, thing, view, picture_size, scheduler, chosen, steps)
     else:
         seen = moving.camera or view.camera(thing, picture_size)
         with steps.step("draw"):
-            frame = drawn(seen)
+            frame = drawing(thing, seen, picture_size, chosen)
     if profile:
         print(chosen.profile)
         chosen.profile = None
     if strokes and not moving.moves:
-        strokes.save(out, frame, None if coarse is thing else coarse, seen, picture_size, chosen, steps)
+        strokes.save(out, frame, coarse, seen, picture_size, chosen, steps)
     elif not moving.moves:
         with steps.step("write"):
             written.save(frame, out)
@@ -195,6 +207,10 @@ def report(source: SourceArgument,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
            spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
+           texels: TexelsOption = None, bits: MapBitsOption = None, layers: LayersOption = None,
+           stored_normals: StoredNormalsOption = False, hit: HitOption = "", center: CenterOption = "",
+           interior: InteriorOption = 16.0, no_maps: NoMapsOption = False, form: FormOption = "cast",
+           faces: FacesOption = 6, normals: MapNormalsOption = "auto",
            device: DeviceOption = "", quiet: QuietOption = False):
     """Write one HTML page about a surface and a view of it: counts, operations, times, the picture."""
     import clsurf
@@ -204,26 +220,15 @@ def report(source: SourceArgument,
     checked_out(out, (".html", ".htm"))
     view = checked_view(direction, up, fov, eye, target, ortho)
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
+    how = with_scale_map(how, texels, bits, layers, stored_normals, hit, center, ("texels", "stored-normals"))
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
+    surfels, scale_map = clsurf.SurfelDrawing(interior, not no_maps), clsurf.ScaleMapDrawing(form, faces, normals)
     chosen = clsurf.open_device(device or None)
-    thing = loaded_surface(source, how, chosen, steps)
+    thing = loaded_surface(source, how, chosen, steps, whole=True)
     with steps.step("report"):
-        clsurf.report(thing, out, view.camera(thing, picture_size), picture_size, title=source.name, lod=lod,
-                      patches=drawing, device=chosen)
+        clsurf.report(thing, out, view.camera(thing, picture_size), picture_size, title=Path(source).name, lod=lod,
+                      patches=drawing, surfels=surfels, scale_map=scale_map, device=chosen)
     steps.say(f"page: {out.resolve()}")
-
-
-def loaded_surface(source: Path, how: Recipe, device, steps: Steps, as_it_is: bool = False):
-    """Return the surface in the file `source`, or the one built from the scan in it; `as_it_is`: the scan."""
-    import clsurf
-    with steps.step("load"):
-        thing = clsurf.load(source)
-    steps.say(f"  {thing}")
-    if not as_it_is and not is_surface(thing):
-        with steps.step("build"):
-            thing = how.build(thing, device, steps)
-        steps.say(f"  {thing}")
-    return thing
 
 
 def checked_drawing(nodes: str, cells: str, alpha: bool):

@@ -117,12 +117,17 @@ def surfel_recipe(degree, error, of_surfels: dict, others: dict) -> Recipe:
 
 
 def with_scale_map(how: Recipe, size: int | None, bits: int | None, layers: int | None, normals: bool, hit: str,
-                   center: str) -> Recipe:
-    """Return the recipe with the options of scale maps, or raise InputError where it makes something else."""
+                   center: str, names: tuple[str, str] = ("size", "normals")) -> Recipe:
+    """Return the recipe with the options of scale maps, or raise InputError where it makes something else.
+
+    `names` are those of the command's options for `size` and `normals`.
+    """
     options = {"size": size, "bits": bits, "layers": layers, "normals": normals, "hit": hit, "center": center}
     options = {name: value for name, value in options.items() if value not in ("", None) and value is not False}
     if options and how.kind != "scale_map":
-        raise InputError(f"--{next(iter(options))}: an option of --kind scale_map, got --kind {how.kind or 'slim'}")
+        name = next(iter(options))
+        raise InputError(f"--{dict(zip(('size', 'normals'), names, strict=True)).get(name, name)}: an option of --kind "
+                         f"scale_map, got --kind {how.kind or 'slim'}")
     if options.get("center", "visible") != "visible":
         options["center"] = parsed_center(options["center"])
     from ..build.scale_map import check_options

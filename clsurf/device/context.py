@@ -160,6 +160,7 @@ class Device:
         """Fill `array` with one value of its dtype."""
         if array.nbytes:
             cl.enqueue_fill_buffer(self.queue, array.buffer, array.dtype.type(value), 0, array.nbytes)
+            self.in_flight.append(array)  # without it, filling an array that died meanwhile wrote to unmapped memory
 
     @_told
     def upload(self, array, dtype=None) -> DeviceArray:

@@ -1,6 +1,8 @@
 """Surfaces that stay in their store: read in parts, from disk or over the network."""
 
+import json
 import warnings
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +11,20 @@ from numpy.typing import NDArray
 from zarr.storage import LocalStore, ZipStore
 
 from clsurf.errors import Error, FileFormatError, InputError
+from clsurf.sizes import checked_budget
+from clsurf.surface.placed import Placed, placed
 from clsurf.surface.slim import SlimSurface
 
 from . import parts
 from .files import one_line
 from .layout import from_arrays
+from .stored_leaves import StoredLeaves
 
 # A store on the web cannot be listed.
 NAMES = ("centers", "radii", "normals", "normal_codes", "coefficients", "level", "leaf", "child_offset", "children",
          "fit_error", "origin")
 OPTIONAL = ("footprint", "colors")
+BUDGET = "1GB"
 
 
 class StoredSurface:
@@ -28,6 +34,9 @@ class StoredSurface:
     ----------
     place : path-like
         A .clsurf folder or zip, or a URL of a folder that fsspec reads, such as "https://host/name.clsurf".
+    budget : int or str
+        Bytes that its leaves may take in memory in `project`, `trace`, `curvature` and `error`, such as "1GB"; pictures
+        have the renderer's budget.
 
     Attributes
     ----------
@@ -44,8 +53,9 @@ class StoredSurface:
         No such store, or one that cannot be read.
     """
 
-    def __init__(self, place):
-        self.place = str(place)
+    def __init__(self, place, budget: int | str = BUDGET):
+        self.place, self.budget = str(place), checked_budget(budget)
+        self._leaves: StoredLeaves | None = None
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -105,6 +115,16 @@ class StoredSurface:
         arrays["children"] = children[keep]
         return from_arrays("slim", arrays, values)
 
+    def leaves(self) -> StoredLeaves:
+        """Return the leaves, which are read where they are asked for; those used last stay in memory."""
+        if self._leaves is None:
+            self._leaves = StoredLeaves(weakref.proxy(self), self.budget)
+        return self._leaves
+
+    def moved(self, matrix) -> Placed:
+        """Return this surface placed by the similarity `matrix` (4, 4)."""
+        return placed(self, matrix)
+
     def load(self) -> SlimSurface:
         """Return the whole surface."""
         if self._single:
@@ -117,7 +137,7 @@ class StoredSurface:
                 f"{self.place!r}, bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
 
     def __reduce__(self):
-        return StoredSurface, (self.place,)
+        return StoredSurface, (self.place, self.budget)
 
 
 def _store(place: str):
@@ -133,13 +153,24 @@ def _store(place: str):
     return LocalStore(path, read_only=True) if path.is_dir() else ZipStore(path, mode="r")
 
 
-def open_surface(place) -> StoredSurface:
+def in_parts(path) -> bool:
+    """Return whether `path` is the folder of a SLIM surface in parts."""
+    try:
+        about = json.loads((Path(path) / "zarr.json").read_text())
+        return about["attributes"]["kind"] == "slim_parts"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def open_surface(place, budget: int | str = BUDGET) -> StoredSurface:
     """Open a SLIM surface in a .clsurf store without reading it whole; see `StoredSurface`.
 
     Parameters
     ----------
     place : path-like or str
         A folder, a zip file, or an address that fsspec reads, such as https://host/survey.clsurf (extra ``scale``).
+    budget : int or str
+        See `StoredSurface`.
 
     Returns
     -------
@@ -150,4 +181,4 @@ def open_surface(place) -> StoredSurface:
     InputError, FileFormatError
         Nothing there, or something else than the store of a SLIM surface.
     """
-    return StoredSurface(place)
+    return StoredSurface(place, budget)

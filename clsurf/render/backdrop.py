@@ -68,6 +68,12 @@ def checked_background(background, scene) -> Backdrop:
     return Backdrop(color=tuple(_four(background)))
 
 
+def around(backdrop: Backdrop, scene) -> Backdrop:
+    """Return what mirrors see where they see no surface: the scene's image light, else what is behind the picture."""
+    light = image_light(scene.lights)
+    return backdrop if light is None else _surroundings(light)
+
+
 def _surroundings(light: Light) -> Backdrop:
     return Backdrop("sky", light=light, picture=light.picture,
                     pixels=linear_picture("light picture", light.picture, SKIES))

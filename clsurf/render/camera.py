@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 
+SEEN = 0.85  # of the radii of base surfels: kernels/common/surfel.clh, CORE
+
 
 @dataclass(frozen=True)
 class Projection:
@@ -242,6 +244,15 @@ def _extent(thing, box) -> tuple[NDArray, NDArray | float]:
     if hasattr(thing, "boxes") and hasattr(thing, "displacement_ranges"):
         points = thing.positions()
         return points[np.isfinite(points[:, 0])], 0.0
+    if hasattr(thing, "normal_atlas") and not thing.hybrid and np.isfinite(box).all():
+        base = thing.base
+        base = base[np.isfinite(thing.positions[base]).all(axis=1) & np.isfinite(thing.radii[base])]
+        flat = np.sqrt(np.clip(1 - thing.normals[base].astype(np.float64) ** 2, 0, 1)).max(axis=1)
+        return thing.positions[base] + thing.origin, SEEN * thing.radii[base] * flat
+    if hasattr(thing, "normal_atlas") and thing.hybrid:
+        return thing.vertices[np.unique(thing.triangles)] + thing.origin, 0.0
+    if hasattr(thing, "scales") and thing.valid.any():
+        return thing.positions()[thing.valid], 0.0
     if hasattr(thing, "points") and len(thing.points):
         return thing.points + thing.origin, 0.0
     return np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]), 0.0

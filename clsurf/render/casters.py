@@ -66,9 +66,18 @@ def casters_of(device: Device, grid: Grid, scene, camera) -> Casters:
     return Casters(packets, singles, device.upload(view_floats(camera, grid.size)), device.upload(pixels))
 
 
+def fresh_mask(device: Device, scratch: Scratch, name: str, bins: int, words: int) -> DeviceArray:
+    """Return a mask (bins, words, 64) uint32 in which nothing is hidden."""
+    mask = scratch.array(name, (bins, words, 64), np.uint32)
+    device.fill(mask, 0)
+    return mask
+
+
 def cast(device: Device, scratch: Scratch, grid: Grid, casters: Casters, lamps: NDArray, reach: float,
          mask: DeviceArray, words: int, word: int) -> None:
     """Fill word `word` of the mask (bins, words, 64) uint32 with the lamps that are hidden by any of the casters.
+
+    Without packets, what is in the mask stays (`fresh_mask`).
 
     Parameters
     ----------
@@ -77,8 +86,6 @@ def cast(device: Device, scratch: Scratch, grid: Grid, casters: Casters, lamps: 
     reach : float
         World units: what lies farther than this before a point does not count; inf: everything counts.
     """
-    if not casters.packets or not len(lamps):
-        device.fill(mask, 0)
     if not len(lamps):
         return
     on_device = device.upload(np.ascontiguousarray(lamps, np.float32))

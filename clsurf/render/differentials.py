@@ -6,6 +6,7 @@ Source: Ohtake, Belyaev, Alexa, SGP 2005, section 4, equation 8. Kernel: kernels
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..io.stored import StoredSurface
 from ..surface.slim import SlimSurface
 from .slim_drawing import SlimDrawing
 
@@ -50,7 +51,7 @@ def check_differentials(placed, names, look: str, drawing: SlimDrawing) -> None:
     """
     if not names:
         return
-    degrees = [surface.degree for surface, _ in placed if isinstance(surface, SlimSurface)]
+    degrees = [surface.degree for surface, _ in placed if isinstance(surface, SlimSurface | StoredSurface)]
     if not degrees:
         raise InputError(f"channel {names[0]}: expected a SlimSurface in the scene, got none: only they have "
                          "curvature; build one with clsurf.build_slim")

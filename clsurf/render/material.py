@@ -40,7 +40,8 @@ class Material:
     stripes : float
         "reflection": dark lines on a sphere.
     mirror : float
-        "phong" and "physical": share, 0 to 1, of mirror reflection (one bounce).
+        "phong" and "physical": share, 0 to 1, of mirror reflection (one bounce) of surfaces, and past them of the
+        image light, or without one of the background.
     """
 
     look: str = "phong"

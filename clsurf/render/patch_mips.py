@@ -13,32 +13,72 @@ from numpy.typing import NDArray
 from ..surface.patch import PatchSurface, opaque_nodes
 from ..surface.srgb import LINEAR_OF_BYTE, to_srgb
 
+OPAQUE = 1 / 8  # cover of a coarse node from which it is opaque; see `halved`
+KEPT = 0.9  # a level's opaque area, of the patch's own, below which the level before stands for it
+
 
 def mip_levels(surface: PatchSurface, most: int = 8) -> list[PatchSurface]:
     """Return the surface and its coarser levels, down to 2 x 2 nodes or `most` levels.
 
-    m nodes become (m + 2) // 2, spread evenly between the same two ends: 17, 9, 5, 3, 2.
+    m nodes become (m + 2) // 2, spread evenly between the same two ends: 17, 9, 5, 3, 2. A patch whose opaque part is
+    too small for a level has the one before in its place: far away it is to cover what it covers near.
     """
-    levels = [surface]
-    while len(levels) < most and len(surface) and (levels[-1].size > 2).any():
-        levels.append(halved(levels[-1]))
+    levels, own = [surface], opaque_area(surface)
+    stays = (surface.size <= 2).all(axis=1)
+    while len(levels) < most and not stays.all():
+        coarse = halved(levels[-1])
+        area = opaque_area(coarse)
+        stays |= (area < KEPT * own) | (coarse.size == levels[-1].size).all(axis=1)
+        if stays.all():
+            break
+        levels.append(mixed(levels[-1], coarse, stays))
     return levels
+
+
+def opaque_area(surface: PatchSurface) -> NDArray:
+    """Return the area (p,) float64, world units squared, of the cells between four opaque nodes of every patch."""
+    opaque, out = opaque_nodes(surface.displacements, surface.colors), np.zeros(len(surface))
+    for which, nodes, m, n in by_size(surface):
+        grid = opaque[nodes].reshape(-1, n, m)
+        out[which] = (grid[:, 1:, 1:] & grid[:, 1:, :-1] & grid[:, :-1, 1:] & grid[:, :-1, :-1]).sum(axis=(1, 2))
+    return out * np.linalg.norm(np.cross(surface.axis_x.astype(np.float64), surface.axis_y), axis=1)
+
+
+def mixed(fine: PatchSurface, coarse: PatchSurface, stays: NDArray) -> PatchSurface:
+    """Return the coarse patches, with the fine ones where `stays` (p,)."""
+    if not stays.any():
+        return coarse
+    counts = np.where(stays, np.diff(fine.node_offset), np.diff(coarse.node_offset))
+    patch = np.repeat(np.arange(len(fine)), counts)
+    within = np.arange(len(patch)) - np.repeat(np.cumsum(counts) - counts, counts)
+    takes = stays[patch]
+    of_fine = fine.node_offset[patch[takes]] + within[takes]
+    of_coarse = coarse.node_offset[patch[~takes]] + within[~takes]
+
+    def nodes(a, b):
+        out = np.empty((len(patch), *a.shape[1:]), a.dtype)
+        out[takes], out[~takes] = a[of_fine], b[of_coarse]
+        return out
+    rows = {name: np.where(stays[:, None], getattr(fine, name), getattr(coarse, name))
+            for name in ("axis_x", "axis_y", "size")}
+    return replace(coarse, **rows, displacements=nodes(fine.displacements, coarse.displacements),
+                   colors=None if coarse.colors is None else nodes(fine.colors, coarse.colors))
 
 
 def with_levels(surface: PatchSurface, most: int) -> tuple[PatchSurface, int]:
     """Return one surface of all levels, patch after patch, and the number of levels.
 
-    Level l of patch k is patch ``k * levels + l``; a patch's finest level that has 2 x 2 nodes stands for coarser ones.
+    Level l of patch k is patch ``k * levels + l``; a patch's coarsest level stands for those beyond it.
     """
     levels = mip_levels(surface, most)
     count = len(levels)
     patch = np.concatenate([np.repeat(np.arange(len(s)), np.diff(s.node_offset)) for s in levels])
     order = np.argsort(patch, kind="stable")
     colors = None if surface.colors is None else np.concatenate([s.colors for s in levels])[order]
-    mixed = {name: np.stack([getattr(s, name) for s in levels], axis=1).reshape(
+    columns = {name: np.stack([getattr(s, name) for s in levels], axis=1).reshape(
         len(surface) * count, *getattr(surface, name).shape[1:])
         for name in ("origins", "axis_x", "axis_y", "axis_z_length", "size")}
-    return replace(surface, **mixed, displacements=np.concatenate([s.displacements for s in levels])[order],
+    return replace(surface, **columns, displacements=np.concatenate([s.displacements for s in levels])[order],
                    colors=colors), count
 
 
@@ -46,8 +86,11 @@ def halved(surface: PatchSurface) -> PatchSurface:
     """Return the next coarser level of a surface.
 
     A coarse node is the tent-weighted mean of the opaque nodes less than one coarse step away; transparent where less
-    than half of that weight is opaque. Nodes on a border average along it only, so that the outline of a patch and what
-    it meets there stay (a mean across it would pull the rim inwards). Colours are averaged in linear light.
+    than an eighth of that weight is opaque. A cell is drawn between four opaque nodes, so that an outline falls up to a
+    coarse step inside of its outermost opaque nodes, half a step on average: where half a step outside of an outline
+    the cover is an eighth, cells reach as far as the fine ones did. Nodes on a border average along it only, so that
+    the outline of a patch and what it meets there stay (a mean across it would pull the rim inwards). Colours are
+    averaged in linear light.
     """
     size = surface.size.astype(np.int64)
     coarse = (size + 2) // 2
@@ -59,7 +102,7 @@ def halved(surface: PatchSurface) -> PatchSurface:
             (offset[which][:, None] + np.arange(((m + 2) // 2) * ((n + 2) // 2))).ravel()
         values[out], cover[out] = _averaged(surface, nodes, m, n)
     kind = surface.displacements.dtype
-    opaque, least = cover >= 0.5, np.iinfo(kind).min
+    opaque, least = cover >= OPAQUE, np.iinfo(kind).min
     d = np.where(opaque, np.rint(values[:, 0]), least if surface.colors is None else 0).astype(kind)
     colors = None if surface.colors is None else _encoded(values[:, 1:], opaque)
     scale = (size - 1) / (coarse - 1)

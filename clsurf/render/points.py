@@ -45,6 +45,7 @@ class CloudUpload:
     order: NDArray  # (stride,) int64: the cloud's numbers of the points; -1: none
     attributes: dict = field(default_factory=dict)  # of the cloud
     made: dict = field(default_factory=dict)  # colours by attribute
+    ranges: dict = field(default_factory=dict)  # of attributes, where they are not those of these points alone
 
 
 def upload_cloud(device: Device, cloud: PointCloud | RangeScan) -> CloudUpload:
@@ -169,6 +170,14 @@ def place_points(upload: CloudUpload, matrix: NDArray | None, camera, size, look
     return view
 
 
+def attribute_range(values: NDArray) -> tuple[float, float]:
+    """Return the values (n,) that the first and the last colour stand for."""
+    values = np.asarray(values, np.float64)
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, (1, 99)) if len(finite) else (0.0, 1.0)
+    return (low, high) if high > low else (values.min(initial=0), values.max(initial=1))
+
+
 def attribute_colors(device: Device, upload: CloudUpload, name: str) -> DeviceArray:
     """Return colours (stride, 4) uint8 by an attribute, made the first time that a frame needs it."""
     if name not in upload.made:
@@ -178,9 +187,7 @@ def attribute_colors(device: Device, upload: CloudUpload, name: str) -> DeviceAr
             raise InputError(f"points attribute: expected one of {', '.join(names) or 'none (the cloud has none)'}, "
                              f"got {name!r}")
         values = np.asarray(values, np.float64)
-        finite = values[np.isfinite(values)]
-        low, high = np.percentile(finite, (1, 99)) if len(finite) else (0.0, 1.0)
-        low, high = (low, high) if high > low else (values.min(initial=0), values.max(initial=1))
+        low, high = upload.ranges[name] if name in upload.ranges else attribute_range(values)
         colors = np.full((upload.stride, 4), 255, np.uint8)
         there = upload.order >= 0
         share = np.nan_to_num((values[upload.order[there]] - low) / max(high - low, 1e-300))

@@ -1,5 +1,6 @@
 """The renderer: a list of stages from a scene to a frame."""
 
+import contextlib
 import os
 import threading
 import weakref
@@ -9,6 +10,7 @@ import numpy as np
 
 from ..device import Device, Profile, host_memory_bytes, open_device
 from ..errors import DeviceError, DeviceMemoryError, InputError
+from ..sizes import checked_budget
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -17,12 +19,13 @@ from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .average import average, fine_channels
-from .backdrop import checked_background, lay_over
+from .backdrop import around, checked_background, lay_over
 from .bands import draw_in_bands
 from .camera import Camera
+from .checked import checked_channels, checked_lod, checked_size, picture_bytes
 from .clip import checked_clip, view_clip
 from .coverage import FACTOR, checked_antialias, cover_edges, edge_channels, edge_layout, mark_edges
-from .differentials import DIFFERENTIALS, NAME, check_differentials, split_differentials, wanted_differentials
+from .differentials import NAME, check_differentials, split_differentials, wanted_differentials
 from .eye_dome import eye_dome
 from .frame import Frame
 from .lighting import OWN_COLORS, prepared_lighting, surface_shading, wants_lighting
@@ -32,9 +35,10 @@ from .mirror import reflect, wants_mirror
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
+from .pieces import CloudPiece, draw_pieces, halves, upload_piece
 from .point_drawing import PointDrawing
 from .points import draw_points, is_unlit, upload_cloud
-from .resident import checked_budget, resident_scene
+from .resident import resident_scene
 from .scale_map import draw_scale_map, upload_scale_map
 from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene
@@ -50,12 +54,11 @@ from .traced_light import light_grid
 KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, draw_patches),
          SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
          Mesh: (upload_mesh, draw_mesh), PointCloud: (upload_cloud, draw_points),
-         RangeScan: (upload_cloud, draw_points)}
+         RangeScan: (upload_cloud, draw_points), CloudPiece: (upload_piece, draw_points)}
 # Made and checked once: 14 us.
 DEFAULT_SHADING = Shading()
 DEFAULT_DRAWINGS = {"patches": PatchDrawing(), "slim": SlimDrawing(), "surfels": SurfelDrawing(),
                     "scale_map": ScaleMapDrawing(), "points": PointDrawing()}
-LARGEST_SIZE = 65536  # pixels across; blocks of 4 pixels are counted in 16 bits
 
 
 class Renderer:
@@ -100,6 +103,7 @@ class Renderer:
         self._scratch: Scratch | None = Scratch(self.device, lanes)
         self._uploads = weakref.WeakKeyDictionary()
         self._residents = weakref.WeakKeyDictionary()
+        self._pieces = weakref.WeakKeyDictionary()  # halves of surfaces that the device does not hold at once
         self.budget, self.wait, self.complete = checked_budget(budget), wait, True
 
     def render(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),
@@ -209,6 +213,7 @@ class Renderer:
             if lighting and len(lighting.materials) > 1:
                 drawn = list(dict.fromkeys([*drawn, "id"]))
             at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not early
+            at_once &= all(surface not in self._pieces for surface, _ in placed)
             grid = self._new_grid(placed, size, drawn, curved, shading, patches, points, view_clip(clip, camera),
                                   early, at_once, lighting)
             floats = shading_floats(shading, scene.lights, back.color, camera)
@@ -229,7 +234,7 @@ class Renderer:
                 self._draw(large, scene, camera, replace(look, lod=FACTOR * lod, cost=False), floats, lighting, FACTOR)
                 cover_edges(self.device, large, edges, self.device.upload(floats[8:12]), arrays["color"])
             if mirrored:
-                reflect(self.device, scene, camera, shading, back, origin, floats, lighting, arrays)
+                reflect(self.device, scene, camera, shading, around(back, scene), origin, floats, lighting, arrays)
             if factor > 1:
                 arrays = average(self.device, arrays, picture, factor, wanted, curved, self._scratch.lanes)
             if "color" in wanted:
@@ -245,6 +250,9 @@ class Renderer:
                 return draw(scene, camera, picture)
             except DeviceMemoryError as error:
                 failed = error
+            if self._cut(scene):
+                with contextlib.suppress(DeviceMemoryError):
+                    return draw(scene, camera, picture)
             # Bands and the picture they make are in memory together, with room for what draws them.
             if not scene.surfaces or 3 * picture_bytes(picture, asked) > host_memory_bytes():
                 raise failed
@@ -260,12 +268,31 @@ class Renderer:
         """
         for number, (surface, matrix) in enumerate(scene.placed):
             own = surface_shading(scene, look.shading, number)
-            KINDS[type(surface)][1](self.device, self._scratch, grid, self._uploaded(surface), matrix, camera,
-                                    look if own is look.shading else replace(look, shading=own), number)
+            seen = look if own is look.shading else replace(look, shading=own)
+
+            def draw(part, surface=surface, matrix=matrix, number=number, seen=seen):
+                try:
+                    KINDS[type(part)][1](self.device, self._scratch, grid, self._uploaded(part), matrix, camera, seen,
+                                         number)
+                finally:
+                    if part is not surface:
+                        self._uploads.pop(part, None)  # room for the next
+
+            draw_pieces(surface, self._pieces, draw)
         if grid.layout.unlit and look.points.eye_dome is not False:
             eye_dome(self.device, self._scratch, grid, look.points, camera, factor)
         if lighting is not None:
             light_grid(self.device, self._scratch, grid, scene, camera, look.shading, floats, look.lamps, lighting)
+
+    def _cut(self, scene) -> bool:
+        """Cut patches that are drawn without planes; return whether anything was."""
+        for surface, _ in scene.placed:
+            if len(scene.placed) == 1 and isinstance(surface, PatchSurface) and surface not in self._pieces:
+                self._pieces[surface] = parts = halves(surface)
+                if parts is None:
+                    del self._pieces[surface]
+                return parts is not None
+        return False
 
     def _framing(self, scene, size) -> Camera:
         thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -315,6 +342,7 @@ class Renderer:
             self._scratch = None
             self._uploads.clear()
             self._residents.clear()
+            self._pieces.clear()
 
     def __repr__(self):
         state = "closed" if self._scratch is None else f"tiles of {BIN * self.tile_bins} pixels"
@@ -342,34 +370,6 @@ def scene_origin(scene) -> np.ndarray:
     return surface.origin.copy() if matrix is None else matrix[:3, :3] @ surface.origin + matrix[:3, 3]
 
 
-def checked_size(size) -> tuple[int, int]:
-    """Return (width, height) as ints, or raise InputError."""
-    try:
-        width, height = (int(v) for v in size)
-        whole = (width, height) == tuple(size)
-    except (TypeError, ValueError):
-        whole = False
-    if not whole or not (1 <= width <= LARGEST_SIZE and 1 <= height <= LARGEST_SIZE):
-        raise InputError(f"size: expected (width, height) in pixels from 1 to {LARGEST_SIZE}, got {size}")
-    return width, height
-
-
-def checked_channels(channels) -> tuple[str, ...]:
-    """Return the channels' names, or raise InputError."""
-    channels = (channels,) if isinstance(channels, str) else tuple(dict.fromkeys(channels))
-    unknown = [name for name in channels if name not in CHANNELS and name not in DIFFERENTIALS]
-    if unknown or not channels:
-        got = ", ".join(map(str, channels)) or "none"
-        raise InputError(f"channels: expected some of {', '.join((*CHANNELS, *DIFFERENTIALS))}, got {got}")
-    return channels
-
-
-def picture_bytes(size: tuple[int, int], channels) -> int:
-    """Return the bytes of a picture's channels."""
-    parts = [CHANNELS.get(name, (3 if name.startswith("direction") else 1, np.float32))[0] for name in channels]
-    return 4 * size[0] * size[1] * sum(max(count, 1) for count in parts)
-
-
 def checked_drawing(name: str, given):
     """Return how a kind is drawn, the default where nothing is given, or raise InputError."""
     drawing = DEFAULT_DRAWINGS[name] if given is None else given
@@ -377,13 +377,6 @@ def checked_drawing(name: str, given):
     if not isinstance(drawing, kind):
         raise InputError(f"{name}: expected a clsurf.{kind.__name__}, got {drawing!r}")
     return drawing
-
-
-def checked_lod(lod) -> float:
-    """Return the level-of-detail threshold in pixels, or raise InputError."""
-    if not isinstance(lod, int | float | np.number) or not 0 <= lod < np.inf:
-        raise InputError(f"lod: expected a projected diameter in pixels of at least 0, got {lod!r}")
-    return float(lod)
 
 
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),

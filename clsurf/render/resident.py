@@ -12,17 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..build.radius import segment_end
-from ..errors import InputError
 from ..io.parts import joined
 from ..io.stored import StoredSurface
-from ..sizes import parse_bytes
 from ..surface.placed import Placed
-from ..surface.slim import SlimSurface
+from ..surface.slim import COEFFICIENTS, SlimSurface, segment_end
 from .scene import Scene
 
 BYTES = 180  # of a surfel: its arrays, and those of the device
 INTERNAL_SCALE = 1.5  # of internal surfels that stand for what is not there, as in render/slim.py
+FIRST_SECONDS = 0.25  # that the first frame waits for the coarse part, without which it shows nothing
 LEAST_PIXELS = 1.0  # a threshold of 0 draws leaves only, however small; the store is read down to this
 
 
@@ -124,16 +122,12 @@ class Resident:
         self._cut = Cut(np.zeros(len(stored.surfels), int))
         self._wanted: Cut | None = None
         self._thread: threading.Thread | None = None
-        self.surface = self._coarse()
+        self.surface = nothing_of(stored)
 
-    def _coarse(self) -> SlimSurface:
-        """Return part 0, read at once: it is small, and without it there is nothing to show."""
-        levels = self.stored.surfels.shape[1]
-        self._parts[0, levels] = self.stored.read(0)
-        taken = self._cut.levels.copy()
-        taken[0] = levels
-        self._cut = Cut(taken)
-        return shown([self._parts[0, levels]], self.stored)
+    @property
+    def begun(self) -> bool:
+        """Whether the coarse levels, part 0, are there."""
+        return bool(self._cut.levels[0])
 
     def view(self, matrix, camera, size, lod: float) -> SlimSurface:
         """Return what there is for a view now, and have the rest of what it needs read."""
@@ -144,8 +138,13 @@ class Resident:
                 return self.surface
             self._wanted = wanted
             if not self.wait and (self._thread is None or not self._thread.is_alive()):
+                self.error = None
                 self._thread = threading.Thread(target=self._read, name="clsurf-resident", daemon=True)
                 self._thread.start()
+            if not self.wait and not self.begun:
+                self._lock.wait_for(lambda: self.begun or self.error is not None, FIRST_SECONDS)
+                if self.error is not None and not self.begun:
+                    raise self.error
         if self.wait:
             self._read()
             if self.error is not None:
@@ -175,14 +174,20 @@ class Resident:
                             break  # the view has moved on
                 self.error = None
             except Exception as error:  # a store on the web that cannot be reached now: what is there stays
-                self.error = error
+                with self._lock:
+                    self.error = error
+                    self._lock.notify_all()
                 return
 
     def _steps(self, wanted: Cut) -> list[Cut]:
-        """Return the cuts on the way: half of what is wanted of every part first, then all."""
+        """Return the cuts on the way: the coarse part, half of what is wanted of every other part, then all."""
+        if self.wait:
+            return [wanted]
+        coarse = Cut(np.where(np.arange(len(wanted.levels)) == 0, wanted.levels, self._cut.levels))
         half = Cut(np.minimum(wanted.levels, np.maximum(self._cut.levels, wanted.levels - 2)))
         half.levels[0] = wanted.levels[0]
-        return [wanted] if self.wait or half == wanted or half == self._cut else [half, wanted]
+        steps = [coarse] * (not self.begun) + [half, wanted]
+        return [cut for cut, before in zip(steps, [self._cut, *steps[:-1]], strict=True) if cut != before]
 
     def _take(self, cut: Cut) -> None:
         kept = {}
@@ -193,6 +198,7 @@ class Resident:
         surface = shown(list(kept.values()), self.stored)
         with self._lock:
             self._parts, self._cut, self.surface = kept, cut, surface
+            self._lock.notify_all()
 
 
 def resident_scene(scene: Scene, residents, camera, size, lod: float, budget: int, wait: bool) -> tuple[Scene, bool]:
@@ -215,12 +221,14 @@ def resident_scene(scene: Scene, residents, camera, size, lod: float, budget: in
     return replace(scene, surfaces=surfaces), complete
 
 
-def checked_budget(budget) -> int:
-    """Return a budget in bytes, or raise InputError."""
-    number = parse_bytes(budget, "budget")
-    if number is None or number <= 0:
-        raise InputError(f"budget: expected bytes or a text such as '2GB', got {budget!r}")
-    return number
+def nothing_of(stored: StoredSurface) -> SlimSurface:
+    """Return a surface without surfels in a stored one's place."""
+    three, one = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+    return SlimSurface(degree=stored.degree, error=stored.error, origin=stored.origin, diagonal=stored.diagonal,
+                       centers=three, radii=one, normals=three,
+                       coefficients=np.zeros((0, COEFFICIENTS[stored.degree]), np.float32),
+                       level=np.zeros(0, np.int32), leaf=np.zeros(0, bool), child_offset=np.zeros(1, np.int32),
+                       children=np.zeros(0, np.int32), fit_error=one)
 
 
 def shown(parts: list[SlimSurface], stored: StoredSurface) -> SlimSurface:

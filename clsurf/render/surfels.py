@@ -102,7 +102,7 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
         None if surface.color_atlas is None else atlas(surface.color_atlas),
         None if colors is None else device.upload(colors), device.upload(surface.level),
         np.concatenate([[0], np.searchsorted(surface.level, values, side="right")]), surface.radii, surface.origin,
-        records[:, 10], center, reach, *below_of(device, surface))
+        np.ascontiguousarray(records[:, 10]), center, reach, *below_of(device, surface))
 
 
 def below_of(device: Device, surface: SurfelHierarchy) -> tuple:

@@ -17,7 +17,9 @@ from ..render.camera import Camera
 from ..render.frame import Frame
 from ..render.patch_drawing import PatchDrawing
 from ..render.renderer import Renderer, checked_lod, checked_size
+from ..render.scale_map_drawing import ScaleMapDrawing
 from ..render.scene import Scene, as_scene
+from ..render.surfel_drawing import SurfelDrawing
 from ..render.tiles import BIN
 from ..surface.patch import PatchSurface
 from ..surface.placed import Placed
@@ -47,7 +49,8 @@ class Times:
 
 
 def report(scene, path, camera: Camera | None = None, size: tuple[int, int] = (500, 500), title: str = "",
-           lod: float = 4.0, patches: PatchDrawing | None = None, device=None) -> None:
+           lod: float = 4.0, patches: PatchDrawing | None = None, surfels: SurfelDrawing | None = None,
+           scale_map: ScaleMapDrawing | None = None, device=None) -> None:
     """Write one self-contained HTML page about a scene and a view of it.
 
     Counts of the model and of what the view touches, for spatial patches the paper's statistics (section 5, Table 3)
@@ -69,6 +72,10 @@ def report(scene, path, camera: Camera | None = None, size: tuple[int, int] = (5
         As in `render`, pixels.
     patches : PatchDrawing, optional
         How spatial patches are drawn.
+    surfels : SurfelDrawing, optional
+        How surfel hierarchies are drawn.
+    scale_map : ScaleMapDrawing, optional
+        How scale maps are drawn.
     device : str, Device, ..., optional
 
     Raises
@@ -84,7 +91,8 @@ def report(scene, path, camera: Camera | None = None, size: tuple[int, int] = (5
         if camera is None:
             box = scene.bounds if np.isfinite(scene.bounds).all() else np.array([[-1.0] * 3, [1.0] * 3])
             camera = Camera.framing(scene if np.isfinite(scene.bounds).all() else box, aspect=size[0] / size[1])
-        frame, times = measured(scene, camera, size, lod, patches, opened)
+        frame, times = measured(scene, camera, size, lod, opened, patches=patches, surfels=surfels,
+                                scale_map=scale_map)
         view = View(camera, size, frame)
         name = title or ", ".join(type(_own(s)).__name__ for s in scene.surfaces) or "an empty scene"
         sections = [_overview(scene, view, times, opened)]
@@ -96,12 +104,12 @@ def report(scene, path, camera: Camera | None = None, size: tuple[int, int] = (5
         temporary.write_text(page(name, sections), encoding="utf-8")
 
 
-def measured(scene: Scene, camera: Camera, size, lod: float, patches, device) -> tuple[Frame, Times]:
+def measured(scene: Scene, camera: Camera, size, lod: float, device, **drawing) -> tuple[Frame, Times]:
     """Return a frame with `CHANNELS`, and the times of frames with "color" and "depth" alone."""
     with Renderer(device) as renderer:
         def draw(channels=("color", "depth")) -> tuple[Frame, float]:
             start = time.perf_counter()
-            frame = renderer.render(scene, camera, size, channels, lod=lod, patches=patches)
+            frame = renderer.render(scene, camera, size, channels, lod=lod, **drawing)
             return frame, time.perf_counter() - start
         first = draw()[1]
         frames = [draw()[1] for _ in range(FRAMES)]

@@ -14,6 +14,13 @@ from .placed import Placed, placed
 
 COEFFICIENTS = {1: 1, 2: 6, 3: 10}  # coefficients of one surfel by degree
 FLOATS = {1: 7, 2: 12, 3: 16}  # floats of one stored surfel by degree (paper, section 4, "Sparsity analysis")
+GOLDEN = (5 ** 0.5 - 1) / 2
+FIRST_RADIUS = 0.1  # r_0 over the diagonal (paper, section 2)
+
+
+def segment_end(level: int) -> float:
+    """Return r_r of the segment of `level` (1 the coarsest), over the diagonal: its surfels are no larger."""
+    return FIRST_RADIUS * GOLDEN ** (level - 1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -61,7 +61,9 @@ class SurfelHierarchy:
     spacing : float
         Median distance between neighbouring base surfels or vertices, world units.
     bound, bound_share : float
-        The distance (world units) within which the finest level lies of the share `bound_share` of the scan's points.
+        The distance (world units) within which the finest level, as it is drawn, lies of the share `bound_share` of
+        the scan: of its points, its faces, and the surface between points that their normals give. Coarser levels lie
+        up to `heights` farther off.
 
     Raises
     ------

@@ -17,7 +17,7 @@ FEWEST = 4096  # rays; fewer are traced one by one
 FARTHEST = 16.0  # diagonals of a surface: from farther away float32 depth tells less than single rays do
 WIDEST = 1 << 16  # rays of a row
 LAYOUT = {"FIELDS": 5, "FIELD_SLOT": 4}  # depth, normal, slot
-VIEW_FLOATS = 32  # kernels/common/view.clh
+VIEW_FLOATS = 64  # kernels/common/view.clh
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
+from ..io.stored import StoredSurface
+from ..surface.placed import Placed
 from . import ray_scale_map, ray_slim, ray_surfels, ray_triangles  # noqa: F401  they register their kinds
 from .grids import grid_of, grid_view, trace_grid
 from .kinds import ANY, CLOSEST, NEXT, traced
@@ -22,6 +24,7 @@ from .single import (
     placement,
     start_rays_host,
 )
+from .stored import merged, trace_stored
 
 QUERIES = {"closest": CLOSEST, "any": ANY, "all": NEXT}
 CHUNK = 1 << 17  # rays of one launch: what is kept of them, 72 bytes each, stays in the caches
@@ -81,7 +84,8 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
 
     Parameters
     ----------
-    thing : SlimSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, a placed one, a Scene, or a list of those
+    thing : SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh, a placed one, a Scene, or a list
+        Of a StoredSurface the parts on the rays' way are read, within its budget.
     origins, directions : (..., 3) array_like
         World space, float64; broadcast against each other. Directions need not be unit; a ray whose direction is zero
         or whose numbers are not finite misses.
@@ -109,6 +113,8 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
     opened = open_device(device)
     rays = checked_rays(origins, directions, near, far)
     parts = [(number, *part) for number, part in enumerate(parts_of(thing))]
+    if any(isinstance(surface, StoredSurface) for _, surface, _ in parts):
+        return _with_stored(parts, rays, query, opened)
     # All surfaces are put on the device, and refused, before the first ray.
     parts = [(number, held, placement(held, matrix), matrix) for number, surface, matrix in parts
              for held in [traced(opened, surface)] if not held.empty]
@@ -126,6 +132,23 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
                 raise Cancelled("trace: stopped")
         tracer.close(start, stop)
     return tracer.result()
+
+
+def _with_stored(parts: list, rays: "Rays", query: str, device: Device) -> Hits:
+    """Trace surfaces of which some stay in their store: those one by one, all others together."""
+    others = [(number, surface if matrix is None else Placed(surface, matrix)) for number, surface, matrix in parts
+              if not isinstance(surface, StoredSurface)]
+    hits, numbers = [], []
+    for number, surface, matrix in parts:
+        if isinstance(surface, StoredSurface):
+            hits.append(trace_stored(surface, matrix, rays, query, device))
+            numbers.append([number])
+    if others:
+        flat = [np.broadcast_to(array, (rays.count, *array.shape[1:])) for array in
+                (rays.origins, rays.directions, rays.near, rays.far)]
+        hits.append(trace([surface for _, surface in others], *flat[:2], query, *flat[2:], device))
+        numbers.append([number for number, _ in others])
+    return merged(hits, numbers, rays, query)
 
 
 def picture_parts(device: Device, rays: "Rays", parts: list) -> tuple[list, list]:

@@ -1,9 +1,11 @@
 """Where the viewer is shown: a window, a notebook, a browser, a terminal, or nowhere, all through rendercanvas."""
 
+import contextlib
 import importlib
 import logging
 import os
 import secrets
+import signal
 import sys
 
 from ..errors import InputError
@@ -18,7 +20,8 @@ FASTEST = 200.0  # pictures a second that a canvas asks for: at 60 its waiting c
 
 
 def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (1024, 768), up=(0, 1, 0),
-         host: str = "127.0.0.1", port: int = 0, folder=".", device=None, report=None, **options):
+         host: str = "127.0.0.1", port: int = 0, folder=".", device=None, report=None, scans=None,
+         shows: str = "surface", **options):
     """Look at a scene interactively.
 
     Parameters
@@ -43,8 +46,12 @@ def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (102
     report : callable, optional
         Called with lines worth telling (the URL, distances, screenshots); by default they are printed, or in a notebook
         only shown in the picture.
+    scans : Mesh, PointCloud, RangeScan, placed, or list of those or None, optional
+        What each of the surfaces was made from: the key t shows the scan as it is, or both.
+    shows : str
+        What is shown at first: "surface", "scan" or "both".
     options
-        Of `Renderer.render`, such as shading, patches, background.
+        Of `Renderer.render`, such as shading, points, background; `budget`: bytes for each `StoredSurface`.
 
     Returns
     -------
@@ -62,7 +69,7 @@ def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (102
     module = backend_module(chosen)
     if report is None:
         report = (lambda line: None) if chosen in ("notebook", "offscreen", "terminal") else _tell
-    viewer = Viewer(scene, camera, size, up, folder, device, report, **options)
+    viewer = Viewer(scene, camera, size, up, folder, device, report, scans=scans, shows=shows, **options)
     # Its word on Ctrl-C is none of the user's business.
     logging.getLogger("rendercanvas").setLevel(logging.ERROR)
     try:
@@ -76,7 +83,7 @@ def view(scene, camera=None, backend: str = "auto", size: tuple[int, int] = (102
             _window(viewer, module, size)
         else:
             attached(viewer, module.RenderCanvas(title="clsurf", max_fps=20), module.loop)
-            module.loop.run()
+            _run(module.loop)
     except BaseException:
         viewer.close()
         raise
@@ -194,8 +201,20 @@ def _window(viewer: Viewer, module, size) -> None:
     except Exception as error:
         raise InputError(f"backend window: cannot be opened: {' '.join(str(error).split())[:150]}: "
                          "try --backend browser") from None
-    module.loop.run()
+    _run(module.loop)
     canvas.close()
+
+
+def _run(loop) -> None:
+    """Run a loop until the user leaves, by Ctrl-C and by a closed terminal too."""
+    before = None
+    with contextlib.suppress(ValueError, AttributeError):  # not the main thread, Windows
+        before = signal.signal(signal.SIGHUP, lambda *_: loop.stop())
+    try:
+        loop.run()
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGHUP, before)
 
 
 def _browser(viewer: Viewer, module, size, host: str, port: int) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import Error
+from .shown import SHOWS
 from .state import (
     DOLLY,
     TURN,
@@ -133,6 +134,22 @@ def _next_surface(viewer) -> None:
         viewer.state = replace(viewer.state, only=only, words=words)
 
 
+def _next_shown(viewer) -> None:
+    if not viewer.scans:
+        viewer.state = replace(viewer.state, words="no scan beside the surface")
+        return
+    shows = SHOWS[(SHOWS.index(viewer.state.shows) + 1) % len(SHOWS)]
+    viewer.state = replace(viewer.state, shows=shows, words="surface and scan" if shows == "both" else shows)
+    if viewer.state.channel not in viewer.channels or viewer.state.lines >= len(viewer.lines):
+        viewer.state = replace(viewer.state, channel="color", lines=0)
+
+
+def _eye_dome(viewer) -> None:
+    on = not viewer.eye_dome
+    words = f"eye-dome lighting of points: {'on' if on else 'off'}"
+    viewer.state = replace(viewer.state, eye_dome=on, words=words)
+
+
 def _clip(axis: str):
     def set_plane(viewer):
         state = clipped(viewer.state, axis)
@@ -196,17 +213,18 @@ def _leave(viewer) -> None:
 
 KEYS = {
     "c": _next_channel, "C": lambda viewer: _next_channel(viewer, -1), "l": _next_lines, "Tab": _next_surface,
-    "n": _next_surface, "x": _clip("x"), "y": _clip("y"), "z": _clip("z"), "v": _clip("view"), "[": _move_clip(-1),
-    "]": _move_clip(1), "m": _measure, "s": _screenshot, "r": _reset, "Home": _reset, "o": _projection, "u": _level,
-    "h": _help, "?": _help, "F1": _help, "Escape": _escape, "q": _leave, "+": _dolly(0.9), "=": _dolly(0.9),
-    "-": _dolly(1 / 0.9), "ArrowLeft": _turn(-5, 0), "ArrowRight": _turn(5, 0), "ArrowUp": _turn(0, -5),
-    "ArrowDown": _turn(0, 5)}
+    "n": _next_surface, "t": _next_shown, "e": _eye_dome, "x": _clip("x"), "y": _clip("y"), "z": _clip("z"),
+    "v": _clip("view"), "[": _move_clip(-1), "]": _move_clip(1), "m": _measure, "s": _screenshot, "r": _reset,
+    "Home": _reset, "o": _projection, "u": _level, "h": _help, "?": _help, "F1": _help, "Escape": _escape,
+    "q": _leave, "+": _dolly(0.9), "=": _dolly(0.9), "-": _dolly(1 / 0.9), "ArrowLeft": _turn(-5, 0),
+    "ArrowRight": _turn(5, 0), "ArrowUp": _turn(0, -5), "ArrowDown": _turn(0, 5)}
 
 # Of the help panel and of docs/viewer.md.
 HELP = [
     ("drag, arrows", "orbit"), ("right or Shift drag", "pan"), ("wheel, + -", "dolly"),
     ("double click", "look at that point"), ("c, Shift c", "next channel, one back"),
     ("l", "lines: contours, suggestive contours, ..."), ("n, Tab", "surfaces one by one, or all"),
+    ("t", "surface, its scan as it is, or both"), ("e", "eye-dome lighting of points, on or off"),
     ("x y z, v", "clip plane: across an axis or the view; other side; off"), ("[ ], Ctrl wheel", "move the clip plane"),
     ("m, Shift click", "distance between two points"), ("s", "screenshot"), ("r, Home", "the first view again"),
     ("u", "upright"), ("o", "orthographic or perspective"), ("Esc", "clear"), ("q", "leave"), ("h", "this help"),

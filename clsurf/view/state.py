@@ -36,6 +36,8 @@ class ViewState:
     channel: str = "color"
     lines: int = 0  # index into the viewer's choices of lines
     only: int = -1  # the one surface that is shown, -1: all
+    shows: str = "surface"  # "surface", "scan" or "both"
+    eye_dome: bool | None = None  # of points; None: as the options of the pictures say
     clip: ClipPlane | None = None
     picks: tuple = ()  # up to two world positions (3,) float64
     measuring: bool = False  # whether a click picks a point

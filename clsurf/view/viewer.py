@@ -13,12 +13,20 @@ from numpy.typing import NDArray
 
 from ..errors import DeviceError, InputError
 from ..render.camera import Camera
+from ..render.point_drawing import PointDrawing
+from ..render.points import is_unlit
 from ..render.renderer import Renderer, checked_size
 from ..render.scene import Scene, as_scene
+from ..render.shade import Shading
 from . import picture
 from .controls import HELP, KEYS, Pointer, pointer_event, wheel_event
 from .pace import FINE, FULL, Pace
+from .shown import checked_scans, checked_shows, scene_of
 from .state import ViewState, point_at
+
+SEEN = ("camera", "clip", "only", "shows", "eye_dome")  # of a state: where one differs, the picture is another
+WAIT = 0.05  # seconds after which a picture is drawn again that lacks parts of a stored surface
+LONGEST_WAIT = 60.0  # seconds that a still picture waits for them
 
 
 class Viewer:
@@ -41,6 +49,12 @@ class Viewer:
         Called with each line that is worth telling: distances, screenshots.
     clock : callable
         Seconds.
+    scans : Mesh, PointCloud, RangeScan, placed, or list of those or None, optional
+        What each of the surfaces was made from: a key shows the scan instead of it, or both.
+    shows : str
+        What is shown at first: "surface", "scan" or "both".
+    budget : int or str
+        Bytes that each `StoredSurface` may take in memory, such as "2GB".
     options
         Of `Renderer.render`, such as shading and background.
 
@@ -55,8 +69,10 @@ class Viewer:
     """
 
     def __init__(self, scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768), up=(0, 1, 0),
-                 folder=".", device=None, report=None, clock=time.perf_counter, **options):
+                 folder=".", device=None, report=None, clock=time.perf_counter, scans=None, shows="surface",
+                 budget: int | str = "2GB", **options):
         self.scene, self.size = as_scene(scene), checked_size(size)
+        self.scans = checked_scans(scans, len(self.scene.surfaces))
         self.folder, self.report, self.clock, self.options = Path(folder), report or (lambda line: None), clock, options
         up = np.asarray(up, np.float64)
         if up.shape != (3,) or not 0 < np.linalg.norm(up) < np.inf:
@@ -73,15 +89,16 @@ class Viewer:
         middle = box.mean(axis=0)
         depth = float(-camera.rotation[2] @ (middle - camera.eye))
         target = camera.eye - camera.rotation[2] * (depth if depth > 0 else float(np.linalg.norm(box[1] - box[0])))
-        self.state = self.home = ViewState(camera, target, up / np.linalg.norm(up))
+        self.state = self.home = ViewState(camera, target, up / np.linalg.norm(up),
+                                           shows=checked_shows(shows, self.scans))
         self._framed = framed
-        self.channels, self.lines = picture.channels_of(self.scene), picture.lines_of(self.scene)
         self.pointer, self.pace, self.closed, self.hint = Pointer(), Pace(), False, True
         self.limits: dict = {}
         self.times: list[float] = []  # seconds of the last pictures
         self._parts: dict = {}
         self._seen = None  # the last picture's frame, its state and the canvas's size
-        self._renderer: Renderer | None = Renderer(device)
+        self._complete = True  # whether the last picture lacks no part of a stored surface
+        self._renderer: Renderer | None = Renderer(device, budget=budget)
 
     @property
     def camera(self) -> Camera:
@@ -97,6 +114,23 @@ class Viewer:
     def diagonal(self) -> float:
         """Of the scene, world units."""
         return float(np.linalg.norm(self.box[1] - self.box[0])) or 1.0
+
+    @property
+    def eye_dome(self) -> bool:
+        """Whether points are shown with eye-dome lighting: as a key, the options or the points' own kind have it."""
+        points = self._drawing().get("points") or PointDrawing()
+        return any(is_unlit(own, points, Shading()) for own, _ in self.shown_scene().placed) \
+            if points.eye_dome is None else points.eye_dome
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What pictures of what is shown can be coloured by."""
+        return self._part()[1]
+
+    @property
+    def lines(self) -> tuple[tuple[str, ...], ...]:
+        """The choices of lines that can be found on what is shown."""
+        return self._part()[2]
 
     # Events -----------------------------------------------------------------------------------------------------------
 
@@ -150,10 +184,10 @@ class Viewer:
 
     def pick(self, x: float, y: float) -> NDArray | None:
         """Return the world position (3,) float64 seen at pixel (x, y) of the canvas; None where there is nothing."""
-        seen = self._seen
-        if seen is None or seen[1].camera is not self.state.camera or seen[1].clip is not self.state.clip \
-                or seen[1].only != self.state.only or seen[2] != self.size or seen[0].size != self.size:
-            self._draw(FULL)
+        seen, state = self._seen, self.state
+        if seen is None or any(getattr(seen[1], name) is not getattr(state, name) for name in SEEN) \
+                or seen[2] != self.size or seen[0].size != self.size or not self._complete:
+            self._whole(FULL)
             seen = self._seen
         column, row = int(x), int(y)
         if not (0 <= column < self.size[0] and 0 <= row < self.size[1]):
@@ -186,7 +220,8 @@ class Viewer:
 
     def due(self) -> float | None:
         """Return in how many seconds the picture should be drawn again to refine it; None: it is as fine as it gets."""
-        return self.pace.due(self.clock())
+        due = self.pace.due(self.clock())
+        return WAIT if due is None and not self._complete else due
 
     def screenshot(self, path=None) -> Path:
         """Write the fine picture, without help and words; return its path, by default a new one in `folder`."""
@@ -197,24 +232,44 @@ class Viewer:
 
     def still(self) -> NDArray:
         """Return the fine picture, (h, w, 4) uint8 sRGB, without help and words."""
-        return picture.written(self._draw(FINE), replace(self.state, help=False, words=""), [])
+        return picture.written(self._whole(FINE), replace(self.state, help=False, words=""), [])
 
     def shown_scene(self) -> Scene:
-        """Return the scene, or the one surface of it that is shown."""
-        only = self.state.only
-        if only < 0:
-            return self.scene
-        if only not in self._parts:
-            self._parts[only] = replace(self.scene, surfaces=(self.scene.surfaces[only],))
-        return self._parts[only]
+        """Return the scene of what is shown: all or one of the surfaces, their scans, or both."""
+        return self._part()[0]
+
+    def _part(self) -> tuple[Scene, tuple, tuple]:
+        """Return the shown scene, its channels and its lines; the same objects while the same is shown."""
+        key = self.state.shows, self.state.only
+        if key not in self._parts:
+            scene = scene_of(self.scene, self.scans, *key)
+            self._parts[key] = scene, picture.channels_of(scene), picture.lines_of(scene)
+        return self._parts[key]
 
     def _draw(self, quality) -> NDArray:
         if self._renderer is None:
             raise DeviceError("viewer: it is closed: make a new one")
         pixels, frame = picture.draw(self._renderer, self.shown_scene(), self.state, self.size, quality,
-                                     self.lines[self.state.lines], self.limits, **self.options)
+                                     self.lines[self.state.lines], self.limits, **self._drawing())
+        self._complete = self._renderer.complete
         self._seen = frame, self.state, self.size
         return pixels
+
+    def _whole(self, quality) -> NDArray:
+        """Draw with all that the view needs of stored surfaces."""
+        end = time.monotonic() + LONGEST_WAIT
+        pixels = self._draw(quality)
+        while not self._complete and time.monotonic() < end:
+            time.sleep(WAIT)
+            pixels = self._draw(quality)
+        return pixels
+
+    def _drawing(self) -> dict:
+        """Return the options of `Renderer.render`, with the eye-dome lighting that a key has set."""
+        if self.state.eye_dome is None:
+            return self.options
+        points = self.options.get("points") or PointDrawing()
+        return self.options | {"points": replace(points, eye_dome=self.state.eye_dome)}
 
     def _written(self, pixels: NDArray, reduce: int) -> NDArray:
         state, hint = self.state, "h: help" if self.hint else ""

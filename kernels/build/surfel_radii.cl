@@ -4,7 +4,7 @@
 #include "common/frame.clh"
 
 #ifndef K
-#define K 16
+#define K 24
 #endif
 #define RIM 0.6f      // spacings, where no neighbour lies within 60 degrees of a direction: the rim of an open surface
 #define LARGEST 2.0f  // spacings

@@ -6,8 +6,9 @@
 // eye, only LOD pixels. A bumpy surfel seen at an angle shows its relief in the wrong place: that may be RELIEF pixels.
 #include "common/surfel.clh"
 
+#define RIM 0.75f  // cones are twice as wide as the normals' deviation (clsurf/build/surfel_tree.py, CONE): no need here
 #ifndef RELIEF
-#define RELIEF 1.0f
+#define RELIEF 0.75f
 #endif
 
 __kernel void select_surfels(__global const float *view, __global const float *surfels, float interior, int begin,
@@ -47,7 +48,7 @@ __kernel void select_surfels(__global const float *view, __global const float *s
   facing = VMAX(facing, -facing);
   VF spread = field[S_SPREAD];
   if (perspective) spread += r * inverse;
-  VF most = SEL((VF)(interior), (VF)(view[LOD]), facing < spread);
+  VF most = SEL((VF)(interior), (VF)(view[LOD]), facing < RIM * spread);
   VF side2 = 1.0f - facing * facing;
   VF shift = scale * field[S_HEIGHT] * VSQRT(VMAX(side2, (VF)(0.0f)));
   VI small = (2.0f * f * r <= most * d) & (f * shift <= RELIEF * d) & ((VI)(perspective ? 0 : TRUE_LANES) | (depth > r));

@@ -91,6 +91,14 @@ __kernel void tile_points(__global const float *view, __global const uint2 *pair
   if (begin == end) return;
   int width = (int)view[WIDTH], height = (int)view[HEIGHT];
   int bin_x = tile % tiles_x * TILE_BINS, bin_y = tile / tiles_x * TILE_BINS;
+#if MASKED
+  int some_wanted = 0;
+  for (int i = 0; i < TILE_BINS * TILE_BINS; i++) {
+    int x = bin_x + i % TILE_BINS, y = bin_y + i / TILE_BINS;
+    some_wanted |= x < bins_x && y < bins_y && WANTED(y * bins_x + x);
+  }
+  if (!some_wanted) return;
+#endif
   to.x = bin_x * BIN; to.y = bin_y * BIN;
   to.slots = slots;
   to.cost = cost;
@@ -127,6 +135,7 @@ __kernel void tile_points(__global const float *view, __global const uint2 *pair
     int x = bin_x + b % TILE_BINS, y = bin_y + b / TILE_BINS;
     if (x >= bins_x || y >= bins_y) continue;
     int bin = y * bins_x + x, was_touched = touched[bin] >= 0;
+    if (!WANTED(bin)) continue;
     __global float *planes = all_planes + (size_t)bin * BIN_PIXELS * FIELDS;
 #if VW == 1
     int px = x * BIN + item % BIN, py = y * BIN + item / BIN;
@@ -151,7 +160,7 @@ __kernel void tile_points(__global const float *view, __global const uint2 *pair
   barrier(CLK_GLOBAL_MEM_FENCE);
   for (int b = item; b < TILE_BINS * TILE_BINS; b += GROUP) {
     int x = bin_x + b % TILE_BINS, y = bin_y + b / TILE_BINS, bin = y * bins_x + x;
-    if (x < bins_x && y < bins_y) touched[bin] = (touched[bin] >= 0 ? touched[bin] : 0) + cost[b];
+    if (x < bins_x && y < bins_y && WANTED(bin)) touched[bin] = (touched[bin] >= 0 ? touched[bin] : 0) + cost[b];
   }
 #endif
 }

@@ -22,6 +22,11 @@
 #ifndef MAPS
 #define MAPS 1        // 0: every surfel is a whole disc with one normal, as in QSplat
 #endif
+#ifndef TRIM
+// Of the disc's facing that a texel's normal must have to be seen. Dragon 1024x1024, surfels up to 16 pixels, 0 and 0.5:
+// 2239 and 735 pixels outside of the finest level's outline, RMS of the angle to its normals 4.69 and 3.13 degrees.
+#define TRIM 0.5f
+#endif
 #ifndef COLOR_MAPS
 #define COLOR_MAPS 0
 #endif
@@ -108,9 +113,11 @@ INLINE int frontmost(PAIRS pairs, int count, uint block, float bucket, __global 
       VF inverse = IS_PERSPECTIVE ? 1.0f / where : (VF)(1.0f);
       VU code = gather_words(atlas, SEL((VI)(as_int(k[MAP])), texels_at(k, u, v, inverse), good));
       good = good & (AS_VI(code) < 0);  // the highest bit: covered
-      // Where the disc faces the eye and the surface there does not, the surface has bent away: past its silhouette.
+      // Past its silhouette the surface has bent away below the disc, which there is seen beside it: of a round surface
+      // from where its normal faces the eye half as much as the disc's.
       VF nx, ny, nz;
       decode_normal(code, &nx, &ny, &nz);
+      nx -= TRIM * k[NX]; ny -= TRIM * k[NY]; nz -= TRIM * k[NZ];
       good = good & (k[FACE] * (nx * rx + ny * ry + nz * rz) < 0.0f);
     }
     *best = SEL(*best, key, good);

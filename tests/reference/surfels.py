@@ -7,7 +7,7 @@ from clsurf.surface.surfel import decoded_normals
 
 FALL, FACING = 4.0, 1e-3  # kernels/build/normal_maps.cl
 SLAB, LEAN, EDGE, BACK, CORE = 0.3, 0.25, 0.02, 0.25, 0.85  # clsurf/render/surfels.py, kernels/render/*surfels.cl
-RIM_SPREAD, RIM_LEAST, RIM_COSINE, RELIEF = 1.75, 0.1, 0.4, 1.0
+RIM_SPREAD, RIM_LEAST, RIM_COSINE, RELIEF, RIM, TRIM = 2.5, 0.1, 0.4, 0.75, 0.75, 0.5
 
 
 def surfel_radii(positions, normals, neighbours, overlap):
@@ -128,7 +128,7 @@ def select_surfels(surface, view, lod, interior):
     distance = np.linalg.norm(p, axis=1) if view.p.perspective else np.ones(n)
     facing = np.abs(-(normal * p).sum(axis=1) / distance if view.p.perspective else normal[:, 2])
     spread = surface.spreads + slope * surface.radii / distance
-    most = np.where(facing < spread, lod, interior)
+    most = np.where(facing < RIM * spread, lod, interior)
     small = (2 * f * surface.radii <= most * d) & (f * surface.heights * np.sqrt(np.maximum(1 - facing**2, 0))
                                                    <= RELIEF * d)
     small &= (-p[:, 2] > surface.radii) if view.p.perspective else True
@@ -181,7 +181,8 @@ def tile_surfels(surface, view, drawn, maps=True):
             atlas = surface.normal_atlas[surface.map_offset[s]:surface.map_offset[s] + w * w, 3].reshape(w, w)
             plain = covered(atlas) and cosine**2 > spread**2 * (ray @ ray)
             if not plain:
-                seen = seen & (face * ((normal @ view.rotation.T) * view.rays).sum(axis=1) < 0)
+                past = (normal - TRIM * surface.normals[s]) @ view.rotation.T
+                seen = seen & (face * (past * view.rays).sum(axis=1) < 0)
         deep = max(abs(n @ p), -LEAN * p[2]) if view.p.perspective else max(abs(cosine), LEAN)
         slab = (SLAB * r + float(surface.heights[s])) / deep
         rows.append((t, a**2 + b**2, inside, seen, face, r * BACK, slab, normal, s))

@@ -112,3 +112,43 @@ def blend(leaves, q, e, side):
     if not total > 0:
         return 0.0, 0.0, np.full(3, np.nan)
     return total, (weight * s * leaves.radii).sum() / total, unit((weight * sides) @ gradient)
+
+
+# Grids ---------------------------------------------------------------------------------------------------------------
+
+
+def on_grid(grid, width, perspective, tolerance, origins, directions):
+    """Whether each ray lies on the grid (4, 3) of clsurf/trace/grids.py; origins and directions (n, 3) or (1, 3)."""
+    start, corner, right, down = np.asarray(grid, float)
+    count = max(len(origins), len(directions))
+    number = np.arange(count)
+    at = corner + (number % width)[:, None] * right + (number // width)[:, None] * down
+    toward = at if perspective else np.broadcast_to(start, at.shape)
+    d = np.broadcast_to(directions, at.shape)
+    d = d / np.linalg.norm(d, axis=1, keepdims=True)
+    along = (d * toward).sum(axis=1)
+    beside = np.linalg.norm(toward - along[:, None] * d, axis=1)
+    if perspective:
+        same = (np.broadcast_to(origins, at.shape) == start).all(axis=1)
+        return same & (beside <= tolerance) & (along > 0)
+    apart = np.linalg.norm(origins - at, axis=1)
+    return (np.hypot(apart, beside * tolerance * 1e9) <= tolerance) & (along > 0)
+
+
+def grid_hits(width, count, view, touched, planes, order, inverse_unit):
+    """Hits (count, 8) of single rays from the planes (bins, 5, 64) of a picture; `view`: kernels/common/view.clh."""
+    bins_x = -(-width // 8)
+    hits = np.zeros((count, 8))
+    hits[:, 0], hits[:, 4] = np.inf, -1
+    turn, fx, fy, cx, cy = np.reshape(view[:9], (3, 3)), *view[13:17]
+    for i in range(count):
+        x, y = i % width, i // width
+        bin_, pixel = y // 8 * bins_x + x // 8, y % 8 * 8 + x % 8
+        depth = planes[bin_, 0, pixel]
+        if touched[bin_] < 0 or not depth < np.inf:
+            continue
+        ray = np.array([(x + 0.5 - cx) / fx, (cy - y - 0.5) / fy, -1.0]) if view[17] else np.array([0, 0, -1.0])
+        hits[i, 0] = depth * np.linalg.norm(ray) / view[9] * inverse_unit
+        hits[i, 1:4] = turn.T @ planes[bin_, 1:4, pixel]
+        hits[i, 4] = order[planes[bin_, 4, pixel].astype(int)]
+    return hits
