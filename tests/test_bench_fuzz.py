@@ -16,18 +16,20 @@ def test_damage_is_repeatable_and_changes_files():
 
 
 def test_whole_files_of_every_format_are_read(device, tmp_path):
-    """What is damaged later is good before; a copy of it damages one file and leaves the whole one alone."""
-    found = fuzz.seeds(tmp_path, device)
-    assert {how for how in (seed.how for seed in found.values())} == {"load", "cameras", "path", "picture", "stored"}
-    reader = fuzz.Reader()
+    """What is damaged later is good before; a copy of a store damages one file and leaves the whole one alone."""
+    found, reader = fuzz.seeds(tmp_path, device), fuzz.Reader()
+    assert {seed.how for seed in found.values()} == {"load", "cameras", "path", "picture", "stored"}
+    store, words = found["folder .clsurf"], []
+    before = {path: path.read_bytes() for path in store.folder.rglob("*") if path.is_file()}
     try:
         for name, seed in found.items():
             assert (name, reader.read(seed.folder / seed.read, seed.how)[0]) == (name, "read")
+        for i in range(30):
+            copy = fuzz.damaged_copy(store, tmp_path / f"copy {i}", np.random.default_rng(i))
+            words.append(reader.read(copy, "stored")[0])
     finally:
         reader.stop()
-    before = {path: path.read_bytes() for path in found["folder .clsurf"].folder.rglob("*") if path.is_file()}
-    for i in range(20):
-        fuzz.damaged_copy(found["folder .clsurf"], tmp_path / f"copy {i}", np.random.default_rng(i))
+    assert set(words) == {"read", "refused"}
     assert all(path.read_bytes() == whole for path, whole in before.items())
 
 
