@@ -147,9 +147,10 @@ def test_a_slow_server_never_blocks_the_picture(stored, whole, device):
     budget = 180 * int(0.7 * len(whole))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Slow, directory=stored.place)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
+        Slow.gates, Slow.asked = {}, []
         remote = clsurf.open_surface(f"http://127.0.0.1:{server.server_address[1]}")
         try:
-            Slow.asked = []
+            Slow.asked.clear()
             Slow.gates = {"parts/00000/": coarse} | {f"parts/{k:05d}/": fine for k in range(1, len(stored.surfels))}
             with clsurf.Renderer(device, budget=budget) as renderer:
                 frame = renderer.render(remote, camera(), SIZE)

@@ -38,7 +38,7 @@ from .patches import draw_patches, shade_patches, upload_patches
 from .pieces import CloudPiece, draw_pieces, halves, upload_piece
 from .point_drawing import PointDrawing
 from .points import draw_points, is_unlit, upload_cloud
-from .resident import resident_scene
+from .resident import Resident, resident_scene
 from .scale_map import draw_scale_map, upload_scale_map
 from .scale_map_drawing import ScaleMapDrawing
 from .scene import as_scene
@@ -199,7 +199,7 @@ class Renderer:
         camera = self._framing(scene, size) if camera is None else camera
         if not isinstance(camera, Camera):
             raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
-        scene, self.complete = resident_scene(scene, self._residents, camera, size, lod, self.budget, self.wait)
+        scene, self.complete = resident_scene(scene, self._residents, camera, size, lod, self._resident)
         check_differentials(scene.placed, curved, shading.look, slim)
 
         def draw(scene, camera, picture):
@@ -328,6 +328,15 @@ class Renderer:
         if upload is None:
             upload = self._uploads[surface] = KINDS[type(surface)][0](self.device, surface)
         return upload
+
+    def _resident(self, stored) -> Resident:
+        device, uploads = self.device, self._uploads
+
+        def prepare(surface):
+            with contextlib.suppress(DeviceMemoryError):  # the frame is then drawn in bands
+                uploads[surface] = upload_slim(device, surface)
+
+        return Resident(stored, self.budget, self.wait, prepare)
 
     def _give_back(self) -> None:
         """Give back what is kept between frames."""
