@@ -94,7 +94,7 @@ class Seed:
     how: str = "load"
 
 
-def seeds(folder: Path) -> dict[str, Seed]:
+def seeds(folder: Path, device) -> dict[str, Seed]:
     """Return whole small files of each format."""
     given = answers.scans(answers.Size(60, (8, 8), 8))
     mesh, cloud, found = given["mesh"], clsurf.models.torus(60), {}
@@ -113,7 +113,7 @@ def seeds(folder: Path) -> dict[str, Seed]:
     plain = Mesh(mesh.vertices[:24], np.arange(24, dtype=np.int32).reshape(-1, 3))
     enter("mesh .ply", "seed.ply", lambda path: clsurf.save(plain, path))
     enter("grid .ply", "seed.ply", grid_ply)
-    stores(folder, mesh, cloud, enter, found)
+    stores(folder, mesh, cloud, enter, found, device)
     frames(folder, given["ranges"].images[0], found)
     cameras(folder, enter, found)
     light = np.random.default_rng(0).random((12, 24, 3)).astype(np.float32)
@@ -136,10 +136,12 @@ def write_picture(path: Path, light) -> None:
     return None
 
 
-def stores(folder: Path, mesh, cloud, enter, found: dict) -> None:
+def stores(folder: Path, mesh, cloud, enter, found: dict, device) -> None:
     """Enter surfaces: zips that are read whole, and zips and folders of which parts are read."""
-    kinds = {"": clsurf.build_slim(cloud, error=0.05), "patches ": clsurf.build_patches(mesh, patches=8, nodes=5),
-             "surfels ": clsurf.build_surfels(cloud, map_size=4), "scale map ": clsurf.build_scale_map(mesh, size=4)}
+    kinds = {"": clsurf.build_slim(cloud, error=0.05, device=device),
+             "patches ": clsurf.build_patches(mesh, patches=8, nodes=5, device=device),
+             "surfels ": clsurf.build_surfels(cloud, map_size=4, device=device),
+             "scale map ": clsurf.build_scale_map(mesh, size=4, device=device)}
     for name, surface in kinds.items():
         enter(f"{name}.clsurf", "seed.clsurf", lambda path, surface=surface: clsurf.save(surface, path))
     enter(".slim2t", "seed.slim2t", lambda path: clsurf.save(kinds[""], path))
@@ -147,7 +149,8 @@ def stores(folder: Path, mesh, cloud, enter, found: dict) -> None:
     place = folder / "streamed"
     place.mkdir()
     clsurf.save(clsurf.models.torus(400), place.with_suffix(".ply"))
-    clsurf.build_slim(place.with_suffix(".ply"), error=0.05, out=place / "seed.clsurf", memory_limit="1GB")
+    clsurf.build_slim(place.with_suffix(".ply"), error=0.05, out=place / "seed.clsurf", memory_limit="1GB",
+                      device=device)
     # Read as it is opened, and whole.
     found["folder .clsurf"] = Seed(place, (), "seed.clsurf", "stored")
     found["whole folder .clsurf"] = Seed(place, (), "seed.clsurf")
@@ -319,9 +322,9 @@ def damaged_copy(seed: Seed, place: Path, random) -> Path:
     return place / seed.read if seed.read else place
 
 
-def fuzz(name: str, seed: Seed, count: int, folder: Path, keep: Path | None) -> dict:
+def fuzz(name: str, seed: Seed, count: int, folder: Path, keep: Path | None, reader: Reader) -> dict:
     """Return what became of `count` damaged copies of the files of `seed`."""
-    random, reader, work = np.random.default_rng(SEED), Reader(), folder / "work"
+    random, work = np.random.default_rng(SEED), folder / "work"
     found = {"format": name, "inputs": count, "read": 0, "refused": 0, "failed": 0, "slowest_s": 0.0, "most_mb": 0.0,
              "first_failure": ""}
     try:
@@ -344,7 +347,6 @@ def fuzz(name: str, seed: Seed, count: int, folder: Path, keep: Path | None) -> 
                         shutil.copytree(work / str(i), keep / f"{name} {i}", dirs_exist_ok=True)
             shutil.rmtree(work)
     finally:
-        reader.stop()
         shutil.rmtree(work, ignore_errors=True)
     return found
 
@@ -361,11 +363,14 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
     keep, only = os.environ.get("CLSURF_FUZZ"), os.environ.get("CLSURF_FUZZ_FORMATS", "").split(",")
     head = ["format", "inputs", "read", "refused", "failed", "slowest s", "most MB", "first failure"]
     with tempfile.TemporaryDirectory() as folder:
-        rows = []
-        for name, seed in seeds(Path(folder)).items():
-            if only == [""] or name in only:
-                rows.append(fuzz(name, seed, count, Path(folder), Path(keep) if keep else None))
-                log.info("%s: %d read, %d refused, %d failed", name, *(rows[-1][key] for key in COUNTED))
+        rows, reader = [], Reader()
+        try:
+            for name, seed in seeds(Path(folder), device).items():
+                if only == [""] or name in only:
+                    rows.append(fuzz(name, seed, count, Path(folder), Path(keep) if keep else None, reader))
+                    log.info("%s: %d read, %d refused, %d failed", name, *(rows[-1][key] for key in COUNTED))
+        finally:
+            reader.stop()
     print_table(head, [[row["format"], row["inputs"], row["read"], row["refused"], row["failed"],
                         f"{row['slowest_s']:.2f}", f"{row['most_mb']:.0f}", row["first_failure"]] for row in rows])
     wrong = [row for row in rows if row["failed"]]

@@ -62,19 +62,19 @@ def test_equal_bytes_for_every_size_of_groups(device, made, monkeypatch):
 
     def other(self, global_size, local_size, arguments):
         if self in free and len(global_size) == 1:
-            wanted = next(size for size in ((4, 2, 1) if local_size[0] == 1 else (16, 8, 4, 2, 1))
+            wanted = next(size for size in ((4, 3, 2, 5, 7, 1) if local_size[0] == 1 else (16, 8, 4, 2, 1))
                           if global_size[0] % size == 0)
             changed.update([self.label] * (wanted != local_size[0]))
             local_size = (wanted,)
         launch(self, global_size, local_size, arguments)
 
-    names = ["normals", "trace", "project"]
+    names = ["normals", "trace"]
     usual = answers.answers(device, SIZE, made, names)
     monkeypatch.setattr(context, "make_kernel", noted)
     monkeypatch.setattr(Kernel, "_launch", other)
     opened = context.Device(device.cl_device)
     found = answers.answers(opened, SIZE, made, names)
-    assert {"knn_covariance", "ray_slim", "start_rays", "project_points"} <= changed
+    assert {"start_rays", "finish_rays", "knn_nodes"} <= changed  # global sizes of others are odd here
     assert [key for key in usual if answers.digest(usual[key]) != answers.digest(found[key])] == []
 
 

@@ -15,6 +15,24 @@ def test_damage_is_repeatable_and_changes_files():
     assert sum(fuzz.damaged(whole, random) != whole for _ in range(50)) > 40
 
 
+def test_whole_files_of_every_format_are_read(device, tmp_path):
+    """What is damaged later is good before; a copy of a store damages one file and leaves the whole one alone."""
+    found, reader = fuzz.seeds(tmp_path, device), fuzz.Reader()
+    assert {seed.how for seed in found.values()} == {"load", "cameras", "path", "picture", "stored"}
+    store, words = found["folder .clsurf"], []
+    before = {path: path.read_bytes() for path in store.folder.rglob("*") if path.is_file()}
+    try:
+        for name, seed in found.items():
+            assert (name, reader.read(seed.folder / seed.read, seed.how)[0]) == (name, "read")
+        for i in range(30):
+            copy = fuzz.damaged_copy(store, tmp_path / f"copy {i}", np.random.default_rng(i))
+            words.append(reader.read(copy, "stored")[0])
+    finally:
+        reader.stop()
+    assert set(words) == {"read", "refused"}
+    assert all(path.read_bytes() == whole for path, whole in before.items())
+
+
 def test_the_reader_tells_what_became_of_a_file(tmp_path):
     clsurf.save(clsurf.models.torus(50), tmp_path / "a.ply")
     (tmp_path / "b.ply").write_bytes(b"ply\ngarbage")
@@ -32,7 +50,7 @@ def test_a_reader_that_fails_is_seen(tmp_path, monkeypatch, text, word):
     """A process that ends, raises, hangs or takes memory instead of reading."""
     path = tmp_path / "a.ply"
     clsurf.save(clsurf.models.torus(50), path)
-    monkeypatch.setattr(fuzz, "READER", fuzz.READER.replace("load(line.rstrip(chr(10)))", f"exec({text!r})"))
+    monkeypatch.setattr(fuzz, "READER", fuzz.READER.replace("READ[how](path)", f"exec({text!r})"))
     monkeypatch.setattr(fuzz, "SECONDS", 0.5)
     reader = fuzz.Reader()
     try:

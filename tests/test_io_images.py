@@ -190,3 +190,13 @@ def test_jpeg_goes_through_memory(tmp_path):
     assert images.read_image(tmp_path / "a.jpg").shape == (5, 7, 3)
     with pytest.raises(InputError, match="65500"):
         images.write_image(tmp_path / "b.jpg", np.zeros((1, 65501, 3), np.uint8))
+
+
+def test_a_damaged_name_is_told_in_text(tmp_path):
+    """OpenImageIO's message quotes the bytes of the name, which are no text."""
+    path = tmp_path / "a.exr"
+    images.write_frame(path, {"color": np.full((4, 4, 4), 0.5, np.float32)})
+    path.write_bytes(path.read_bytes().replace(b"chlist", b"chli\xd6t"))
+    for read in (images.read_image, images.read_channels):
+        with pytest.raises(FileFormatError, match="no text"):
+            read(path)

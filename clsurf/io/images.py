@@ -340,4 +340,7 @@ def _whole(value: NDArray, bits: int, shift=0.0) -> NDArray:
 
 
 def _oiio_error(source) -> str:
-    return one_line(ValueError(source.geterror() or "unknown error"))
+    try:
+        return one_line(ValueError(source.geterror() or "unknown error"))
+    except UnicodeDecodeError:  # it quotes the file
+        return "names in it are no text"

@@ -24,6 +24,8 @@ from .stored_leaves import StoredLeaves
 NAMES = ("centers", "radii", "normals", "normal_codes", "coefficients", "level", "leaf", "child_offset", "children",
          "fit_error", "origin")
 OPTIONAL = ("footprint", "colors")
+# What zarr, its codecs and the data types raise for damaged parts; a server that fails raises others.
+_DAMAGED = (ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError)
 BUDGET = "1GB"
 
 
@@ -98,7 +100,23 @@ class StoredSurface:
         return int(self.surfels.sum())
 
     def read(self, part: int, levels: int | None = None) -> SlimSurface:
-        """Return a part as a surface of its own, or its surfels of the levels up to `levels` only."""
+        """Return a part as a surface of its own, or its surfels of the levels up to `levels` only.
+
+        Raises
+        ------
+        FileFormatError
+            A damaged part.
+        """
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return self._read(part, levels)
+        except Error:
+            raise
+        except (*_DAMAGED, MemoryError) as error:
+            raise FileFormatError(f"{self.place}: part {part} is damaged: {one_line(error)}") from error
+
+    def _read(self, part: int, levels: int | None) -> SlimSurface:
         group = self._group if self._single else self._group[f"parts/{part:05d}"]
         values = dict(group.attrs["values"])
         rows = None if levels is None or self._single else int(self.surfels[part, :levels].sum())
