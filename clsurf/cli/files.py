@@ -30,6 +30,7 @@ from .recipe import (
     with_scale_map,
     with_tolerance,
 )
+from .sources import TextureOption, picture_of
 from .stream import checked_stream, stream
 
 
@@ -156,7 +157,7 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
                                               "as 1GB; stopped builds go on with the same command.")] = "",
           scheduler: Annotated[str, typer.Option(help="Stream the scan on the workers of a Dask scheduler, "
                                                  "tcp://host:8786 or local; they see the same files.")] = "",
-          device: DeviceOption = "", quiet: QuietOption = False):
+          texture: TextureOption = "", device: DeviceOption = "", quiet: QuietOption = False):
     """Turn a scan into a surface: SLIM surfels, spatial patches, surfels with normal maps, or a spherical scale map."""
     import clsurf
     steps = Steps(quiet)
@@ -165,11 +166,13 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
     how = with_scale_map(how, size, bits, layers, normals, hit, center)
     how = with_tolerance(how, tolerance)
     if memory or scheduler:
+        if texture:
+            raise InputError(f"texture: expected none for a streamed scan, got {texture}")
         stream(scan, checked_stream(memory, out), how, memory, scheduler, device or None, steps)
         return
     checked_out(out, (".clsurf", ".slim2t") if how.kind in ("", "slim") else (".clsurf",))
     with steps.step("load"):
-        loaded = clsurf.load(scan)
+        loaded = clsurf.load(scan, picture_of(texture))
     steps.say(f"  {loaded}")
     if is_surface(loaded) and how.kind != "scale_map":
         raise InputError(f"{scan}: expected a scan, got a surface ({type(loaded).__name__})")

@@ -51,7 +51,7 @@ from .recipe import (
     recipe,
     with_scale_map,
 )
-from .sources import loaded_surface, surface_in
+from .sources import TextureOption, loaded_surface, surface_in
 
 SourceArgument = Annotated[str, typer.Argument(help="A surface, or a scan (its surface is then built first), or the "
                                                "address of a streamed surface.")]
@@ -132,7 +132,8 @@ def render(source: SourceArgument,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
            form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
            drawn_as: AsOption = "surface", point_size: PointSizeOption = "", eye_dome: EyeDomeOption = None,
-           attribute: AttributeOption = "", kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "",
+           attribute: AttributeOption = "", texture: TextureOption = "",
+           kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "",
            patches: PatchesOption = None, spacing: SpacingOption = None, map_size: MapSizeOption = None,
            hybrid: HybridOption = False, profile: ProfileOption = False, device: DeviceOption = "",
            quiet: QuietOption = False):
@@ -166,6 +167,8 @@ def render(source: SourceArgument,
     as_it_is, points = wants_scan(drawn_as, lines, channel, kind), point_drawing(point_size, eye_dome, attribute)
     if colored:
         colored.prepared(how, degree)
+    if texture and (scheduler or strokes):
+        raise InputError(f"texture: expected none with --{'scheduler' if scheduler else 'lines'}, got {texture}")
     # Workers have devices of their own.
     chosen = device or None if scheduler else clsurf.open_device(device or None)
     coarse = None
@@ -177,7 +180,7 @@ def render(source: SourceArgument,
         coarse = None if found_on is thing else found_on
         wanted = strokes.channels(wanted, coarse is None)
     else:
-        thing = loaded_surface(source, how, chosen, steps, as_it_is)
+        thing = loaded_surface(source, how, chosen, steps, as_it_is, texture=texture)
     drawing = Drawing(lit, written, wanted, lod, {
         "supersampling": supersampling, "patches": patch_drawing, "surfels": surfels, "scale_map": scale_map,
         "points": points}, colored, strokes, coarse)

@@ -1,28 +1,46 @@
 """What commands draw: the surfaces and scans in files, and streamed surfaces that stay where they are."""
 
+from typing import Annotated
+
+import typer
+
 from ..errors import InputError
 from .common import Steps, is_surface
 from .recipe import Recipe
 
+TextureOption = Annotated[str, typer.Option(help="Picture for a mesh whose file has texture coordinates but names no "
+                                            "picture: FILE, or FILE:flip where it is upside down.")]
+FLIP = ":flip"
 
-def loaded(source, steps: Steps):
+
+def picture_of(texture: str):
+    """Return what `clsurf.load` takes for the option --texture."""
+    if texture.endswith(FLIP):
+        from ..io.images import read_image
+        return read_image(texture.removesuffix(FLIP))[::-1]
+    return texture or None
+
+
+def loaded(source, steps: Steps, texture: str = ""):
     """Return what the file `source` holds; a surface in parts, in a folder or on the web, is only opened."""
     import clsurf
 
     from ..io.stored import in_parts
     with steps.step("load"):
-        thing = clsurf.open_surface(source) if "://" in str(source) or in_parts(source) else clsurf.load(source)
+        stays = "://" in str(source) or in_parts(source)
+        thing = clsurf.open_surface(source) if stays and not texture else clsurf.load(source, picture_of(texture))
     steps.say(f"  {thing}")
     return thing
 
 
-def loaded_surface(source, how: Recipe, device, steps: Steps, as_it_is: bool = False, whole: bool = False):
+def loaded_surface(source, how: Recipe, device, steps: Steps, as_it_is: bool = False, whole: bool = False,
+                   texture: str = ""):
     """Return the surface in the file `source`, or the one built from the scan in it.
 
     `as_it_is`: the scan; `whole`: read a surface in parts as one.
     """
     import clsurf
-    thing = loaded(source, steps)
+    thing = loaded(source, steps, texture)
     if not as_it_is and not is_surface(thing):
         thing = built(thing, how, device, steps)
     return thing.load() if whole and isinstance(thing, clsurf.StoredSurface) else thing
@@ -45,8 +63,11 @@ def built(scan, how: Recipe, device, steps: Steps):
     return surface
 
 
-def scans_and_surfaces(sources, how: Recipe, drawn_as: str, device, steps: Steps) -> tuple[list, list | None]:
+def scans_and_surfaces(sources, how: Recipe, drawn_as: str, device, steps: Steps,
+                       texture: str = "") -> tuple[list, list | None]:
     """Return what the files are shown as, and the scan behind each where it was built from one; None without any.
+
+    `texture`: of the first.
 
     Raises
     ------
@@ -58,7 +79,7 @@ def scans_and_surfaces(sources, how: Recipe, drawn_as: str, device, steps: Steps
         raise InputError(f"as: expected {', '.join(SHOWS[:-1])} or {SHOWS[-1]}, got {drawn_as!r}")
     if drawn_as == "scan" and how.kind:
         raise InputError(f"kind: expected none with --as scan, got {how.kind!r}: no surface is built")
-    things = [loaded(source, steps) for source in sources]
+    things = [loaded(source, steps, texture if i == 0 else "") for i, source in enumerate(sources)]
     scans = [None if is_surface(thing) else thing for thing in things]
     if drawn_as != "surface" and not any(scan is not None for scan in scans):
         raise InputError(f"as: expected a scan to show as {drawn_as}, got surfaces only")

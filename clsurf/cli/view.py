@@ -11,6 +11,7 @@ from .common import DeviceOption, QuietOption, SizeOption, Steps, parsed_size
 from .motion import CameraOption, IgnoreOption, camera_of
 from .raw_scans import AttributeOption, EyeDomeOption, PointSizeOption, point_drawing
 from .recipe import DegreeOption, ErrorOption, KindOption, PatchesOption, SpacingOption, recipe
+from .sources import TextureOption, scans_and_surfaces
 
 BackendOption = Annotated[str, typer.Option(help="window, browser, terminal, or auto: a window where there is a "
                                             "display, else the browser.")]
@@ -32,7 +33,8 @@ def view(sources: Annotated[list[str], typer.Argument(help="Surfaces or scans, s
          camera: CameraOption = "", ignore_distortion: IgnoreOption = False,
          kind: KindOption = "", degree: DegreeOption = None, error: ErrorOption = "", patches: PatchesOption = None,
          spacing: SpacingOption = None, drawn_as: ShowsOption = "surface", point_size: PointSizeOption = "",
-         eye_dome: EyeDomeOption = None, attribute: AttributeOption = "", budget: BudgetOption = "2GB",
+         eye_dome: EyeDomeOption = None, attribute: AttributeOption = "", texture: TextureOption = "",
+         budget: BudgetOption = "2GB",
          device: DeviceOption = "", quiet: QuietOption = False):
     """Look at surfaces and scans: turn, measure, cut, take pictures; h shows the keys."""
     import clsurf
@@ -40,7 +42,6 @@ def view(sources: Annotated[list[str], typer.Argument(help="Surfaces or scans, s
     from ..render.renderer import checked_size
     from ..sizes import checked_budget
     from ..view.canvas import BACKENDS, backend_module, chosen_backend
-    from .sources import scans_and_surfaces
     # Every option is checked before the work.
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     seen_from = checked_view(direction, up, fov, eye, target, ortho)
@@ -58,7 +59,7 @@ def view(sources: Annotated[list[str], typer.Argument(help="Surfaces or scans, s
     how = recipe(kind, degree, error, patches=patches, spacing=spacing)
     points, kept = point_drawing(point_size, eye_dome, attribute), checked_budget(budget)
     opened = clsurf.open_device(device or None)
-    surfaces, scans = scans_and_surfaces(sources, how, drawn_as, opened, steps)
+    surfaces, scans = scans_and_surfaces(sources, how, drawn_as, opened, steps, texture)
     scene = clsurf.Scene(surfaces)
     seen = given if given or plain else seen_from.camera(scene, picture_size)
     viewer = clsurf.view(scene, seen, chosen, picture_size, seen_from.up, host, port, folder, opened,

@@ -15,7 +15,7 @@ RANGES = (".conf", ".json")  # and folders of frames
 WRITES = (*scans.WRITES, *SURFACES)
 
 
-def load(path):
+def load(path, texture=None):
     """Read a scan or a surface.
 
     Parameters
@@ -24,6 +24,9 @@ def load(path):
         A scan (.ply .obj .stl .off .glb .gltf .xyz .txt .asc .pts .csv .npy .npz .las .laz), cleaned as `clean_scan`
         does, or what `save` wrote: .clsurf, .slim2t. Range images: .conf (Stanford's, with its .ply files beside it),
         or a folder of depth and colour frames or its .json file of intrinsics, as `load_frames` reads them.
+    texture : path-like or (h, w, 1 to 4) array, optional
+        A picture for a mesh whose file has texture coordinates but names no picture, row 0 on top. Where it comes out
+        upside down (glTF counts from the top, and not every program knows), flip the array.
 
     Returns
     -------
@@ -32,10 +35,13 @@ def load(path):
     Raises
     ------
     InputError
-        No such file, or an unknown ending.
+        No such file, an unknown ending, or a `texture` for something without texture coordinates.
     FileFormatError
         An empty, truncated, damaged or foreign file.
     """
+    if texture is not None:
+        from .meshes import with_texture
+        return with_texture(load(path), texture, path)
     ending = _ending(path)
     if ending == ".clsurf":
         from .store import load_store

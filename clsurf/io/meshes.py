@@ -5,19 +5,20 @@ import json
 import logging
 import os
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from clsurf.errors import FileFormatError
+from clsurf.errors import FileFormatError, InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
 from .colors import as_rgba8
 from .files import write_array
-from .images import write_image
+from .images import read_image, to_srgb8, write_image
 from .rows import BLOCK, digits_of, world_of, write_rows
 
 _NO_PICTURE = (2, 2)  # what trimesh puts where a material names no picture
@@ -117,6 +118,25 @@ def _texture_of(material) -> NDArray | None:
     if picture is not None and picture.size != _NO_PICTURE:
         return np.array(picture.convert("RGBA"))
     return None
+
+
+def with_texture(scan, picture, path) -> Mesh:
+    """Return a mesh with a picture, a file or an array, as its texture; `path`: where the mesh came from."""
+    if not isinstance(scan, Mesh) or scan.uv is None:
+        raise InputError(f"texture: expected a mesh with texture coordinates, got {path}, which has none")
+    pixels = picture if isinstance(picture, np.ndarray) else read_image(picture)
+    if pixels.ndim != 3 or not 1 <= pixels.shape[2] <= 4 or pixels.dtype not in (np.uint8, np.uint16, np.float32):
+        raise InputError("texture: expected a picture (h, w, 1 to 4) of uint8, uint16 or float32, got "
+                         f"{pixels.shape} {pixels.dtype}")
+    if pixels.dtype == np.uint16:
+        pixels = np.round(pixels / 257).astype(np.uint8)
+    if pixels.shape[2] < 3:  # grey, and alpha
+        pixels = np.concatenate([pixels[..., :1]] * 3 + [pixels[..., 1:]], axis=2)
+    if pixels.dtype != np.uint8:
+        pixels = to_srgb8(pixels)
+    texture = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+    texture[..., :pixels.shape[2]] = pixels
+    return replace(scan, texture=texture)
 
 
 def _check_stl(path: Path) -> None:
