@@ -23,6 +23,7 @@ from clsurf.surface.patch import PatchSurface
 from clsurf.surface.slim import SlimSurface
 
 from .layout import from_arrays, to_arrays
+from .store_arrays import VERSION, create_array, read_arrays
 
 KINDS = {"slim_parts": "slim", "patches_parts": "patches"}  # and the kind of their parts
 SHARED = ("degree", "error", "diagonal", "bound", "bound_share", "oriented")
@@ -31,7 +32,6 @@ CHUNK_BYTES = 1 << 20
 
 def write_part(folder: Path, number: int, surface: SlimSurface) -> None:
     """Write part `number` of the surface in `folder`; it appears whole or not at all."""
-    from .store import VERSION, create_array
     target = part_folder(folder, number)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}")
@@ -55,7 +55,6 @@ def part_folder(folder: Path, number: int) -> Path:
 
 def write_index(folder: Path, values: dict, bounds: NDArray, surfels: NDArray, kind: str = "slim") -> None:
     """Write the root of a surface whose parts are there, all of `kind`: after this the folder is a store."""
-    from .store import VERSION, create_array
     for left in (folder / "parts").glob(".*"):  # of a worker that was killed while it wrote
         shutil.rmtree(left, ignore_errors=True)
     with warnings.catch_warnings():
@@ -140,7 +139,6 @@ def joined_patches(parts: list[PatchSurface], shared: dict) -> PatchSurface:
 
 def read_parts(path: Path, group: zarr.Group, members) -> SlimSurface | PatchSurface:
     """Return the surface of a store in parts, whole."""
-    from .store import read_arrays
     values, kind = dict(group.attrs["values"]), KINDS[group.attrs["kind"]]
     parts = []
     for number in range(int(values["parts"])):

@@ -5,27 +5,18 @@ flags. Arrays are named as the fields of the data types, chunked by rows and com
 shuffling). Any Zarr library reads them.
 """
 
-import math
 import warnings
-import zipfile
 from pathlib import Path
 
-import numpy as np
 import zarr
-from zarr.codecs import BloscCodec, BytesCodec
 from zarr.storage import LocalStore, ZipStore
 
-from clsurf.errors import Error, FileFormatError, InputError
+from clsurf.errors import Error, FileFormatError
 
 from . import parts
 from .files import existing_file, one_line, replacing
 from .layout import KINDS, from_arrays, to_arrays
-
-VERSION = 1
-_CHUNK_BYTES = 1 << 21  # of one chunk: parts can be read remotely, yet a surface has few files
-_LARGEST_CHUNK = 1 << 30  # that is read
-_MOST_COMPRESSED = 20_000  # array bytes per stored byte: zstd on a constant chunk of 2 MB reaches 10,000
-_BLOSC_HEADER = 16
+from .store_arrays import VERSION, FolderMembers, Members, create_array, read_arrays, zip_members
 
 
 def save_store(thing, path) -> None:
@@ -50,17 +41,6 @@ def save_store(thing, path) -> None:
             store.close()
 
 
-def create_array(group: zarr.Group, name: str, array, chunk_bytes: int = _CHUNK_BYTES, codec: str = "zstd") -> None:
-    """Write `array` into a group as its member `name`, in chunks of rows."""
-    array = np.ascontiguousarray(array)
-    row_bytes = max(1, array.dtype.itemsize * math.prod(array.shape[1:]))
-    rows = min(max(1, chunk_bytes // row_bytes), max(1, array.shape[0] if array.ndim else 1))
-    shuffled = BloscCodec(typesize=array.dtype.itemsize, cname=codec, clevel=5, shuffle="bitshuffle")
-    # Chunks of zeros are written too: a missing chunk is then always a damaged store.
-    group.create_array(name, data=array, chunks=(rows, *(max(1, n) for n in array.shape[1:])), compressors=shuffled,
-                       serializer=BytesCodec(endian="little"), filters=None, config={"write_empty_chunks": True})
-
-
 def load_store(path):
     """Read a surface or scan from a .clsurf zip or folder.
 
@@ -72,12 +52,12 @@ def load_store(path):
         Not such a store, damaged, truncated, or written by a newer version of the format.
     """
     folder = Path(path)
-    members: _Members
+    members: Members
     if folder.is_dir():
-        members, path = _FolderMembers(folder), folder
+        members, path = FolderMembers(folder), folder
     else:
         path = existing_file(path)
-        members = _zip_members(path)
+        members = zip_members(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -96,7 +76,7 @@ def load_store(path):
         members.close()
 
 
-def _read_group(path: Path, group: zarr.Group, members: "_Members"):
+def _read_group(path: Path, group: zarr.Group, members: "Members"):
     about = dict(group.attrs)
     if about.get("format") != "clsurf":
         raise FileFormatError(f"{path}: a Zarr group, but not a clsurf store (its format is {about.get('format')!r})")
@@ -111,87 +91,3 @@ def _read_group(path: Path, group: zarr.Group, members: "_Members"):
     if kind not in KINDS:
         raise FileFormatError(f"{path}: holds the unknown kind {kind!r}: expected {', '.join(KINDS)}")
     return from_arrays(kind, read_arrays(path, group, members), dict(about["values"]))
-
-
-def read_arrays(path: Path, group: zarr.Group, members: "_Members", prefix: str = "") -> dict:
-    """Return all arrays of `group`, whose members' names start with `prefix`, after checking what they declare."""
-    # One by one: zarr's concurrent listing of members writes the traceback of a damaged one to the terminal.
-    keys = [key.removeprefix(prefix) for key in sorted(members.sizes) if key.startswith(prefix)]
-    names = [key.removesuffix("/zarr.json") for key in keys if key.endswith("/zarr.json")]
-    found = {name: item for name, item in ((name, group[name]) for name in names) if isinstance(item, zarr.Array)}
-    for name, array in found.items():
-        _check_array(path, prefix + name, array, members)
-    return {name: np.asarray(array[...]) for name, array in found.items()}
-
-
-def _check_array(path: Path, name: str, array: zarr.Array, members: "_Members") -> None:
-    """Refuse an array whose chunks are missing or cannot hold what it declares, before memory is taken."""
-    codecs = array.metadata.codecs
-    plain = array.dtype.kind in "biuf" and all(isinstance(codec, BytesCodec | BloscCodec) for codec in codecs)
-    if not plain or len(codecs) != 2:
-        raise FileFormatError(f"{path}: {name}: unexpected type {array.dtype} or encoding {codecs!r}")
-    chunk_bytes = array.dtype.itemsize * math.prod(array.chunks)
-    count = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True))
-    prefix = f"{name}/c/" if array.shape else f"{name}/c"
-    chunks = [key for key in members.sizes if key.startswith(prefix)]
-    stored = sum(members.sizes[key] for key in chunks)
-    if len(chunks) != count:
-        raise FileFormatError(f"{path}: {name}: expected {count:,} chunks, got {len(chunks):,}: truncated or damaged")
-    if chunk_bytes > _LARGEST_CHUNK or array.nbytes > _MOST_COMPRESSED * (stored + 4096):
-        raise FileFormatError(f"{path}: {name}: shape {array.shape} does not fit in {stored:,} stored bytes: damaged")
-    for key in chunks:
-        head = members.head(key)
-        if len(head) < _BLOSC_HEADER or int.from_bytes(head[4:8], "little") != chunk_bytes or (
-                int.from_bytes(head[12:16], "little") != members.sizes[key]):
-            raise FileFormatError(f"{path}: {name}: damaged chunk {key}")
-
-
-class _Members:
-    """Sizes of the files in a store by name, and their first bytes."""
-
-    sizes: dict[str, int]
-
-    def head(self, key: str) -> bytes:
-        raise InputError(f"no such member {key}")
-
-    def close(self) -> None:
-        pass
-
-
-class _ZipMembers(_Members):
-    def __init__(self, path: Path):
-        self._zip = zipfile.ZipFile(path)
-        self.sizes = {item.filename: item.file_size for item in self._zip.infolist()}
-
-    def head(self, key: str) -> bytes:
-        with self._zip.open(key) as file:
-            return file.read(_BLOSC_HEADER)
-
-    def close(self) -> None:
-        self._zip.close()
-
-
-class _FolderMembers(_Members):
-    def __init__(self, path: Path):
-        self._path = path
-        self.sizes = {p.relative_to(path).as_posix(): p.stat().st_size for p in path.rglob("*") if p.is_file()}
-        if "zarr.json" not in self.sizes:
-            raise FileFormatError(f"{path}: a folder, but not a .clsurf store: it has no zarr.json")
-
-    def head(self, key: str) -> bytes:
-        with open(self._path / key, "rb") as file:
-            return file.read(_BLOSC_HEADER)
-
-
-def _zip_members(path: Path) -> _Members:
-    size = path.stat().st_size
-    try:
-        members = _ZipMembers(path)
-    except Exception as error:  # zipfile raises more than BadZipFile on garbage
-        raise FileFormatError(f"{path}: not a .clsurf store (a zip file): {one_line(error)}: truncated?") from None
-    total = sum(members.sizes.values())
-    if total > 4 * size + 4096 or "zarr.json" not in members.sizes:
-        members.close()
-        raise FileFormatError(f"{path}: a zip file, but not a .clsurf store" if "zarr.json" not in members.sizes else
-                              f"{path}: damaged: {total:,} bytes claimed in a file of {size:,}")
-    return members
