@@ -56,6 +56,9 @@ def test_seams_of_textures_are_no_rims(device):
     points = queries(seed=2)
     one, other = (clsurf.project(mesh, points, device) for mesh in (box, apart))
     assert np.array_equal(one.distance, other.distance)
+    for point in points[:20]:  # alone: the faces around its foot share no vertex with the nearest one
+        one, other = (clsurf.project(mesh, point[None], device) for mesh in (box, apart))
+        assert np.allclose(one.normal, other.normal)
 
 
 def test_patches_are_their_triangles(device):

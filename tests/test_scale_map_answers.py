@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from reference import scale_map as twin
 from reference.trace_rays import unit
+from trimesh.triangles import closest_point
 
 import clsurf
-from clsurf.build.triangles import closest_on_triangles, nearest_triangles
+from clsurf.build.triangles import nearest_triangles
 from clsurf.errors import InputError
 from clsurf.surface.scale_map import ScaleMap
 from clsurf.surface.scale_mesh import scale_mesh
@@ -42,7 +43,7 @@ def test_nearest_triangles(device):
     corners = rng.normal(size=(300, 3, 3)) + 3
     points = 2 * rng.normal(size=(400, 3)) + 3
     distance, face = nearest_triangles(corners.reshape(-1, 3), np.arange(900).reshape(-1, 3), points, device)
-    every = np.stack([np.linalg.norm(closest_on_triangles(points, np.broadcast_to(t, (400, 3, 3))) - points, axis=1)
+    every = np.stack([np.linalg.norm(closest_point(np.broadcast_to(t, (400, 3, 3)), points) - points, axis=1)
                       for t in corners])
     assert np.abs(distance - every.min(axis=0)).max() < 1e-5
     assert np.abs(every[face, np.arange(400)] - every.min(axis=0)).max() < 1e-5

@@ -6,10 +6,12 @@ TVCG 11(3), 2005: right at edges and vertices too, where the nearest face alone 
 
 import numpy as np
 from numpy.typing import NDArray
+from trimesh.triangles import angles, closest_point
 
 from ..device import Device
+from ..io.cleaning import first_of_duplicates
 from ..surface.mesh import Mesh
-from .triangles import closest_on_triangles, nearest_triangles
+from .triangles import nearest_triangles
 
 ON_EDGE = 1e-6  # share of a corner below which a foot lies on the opposite edge
 
@@ -23,7 +25,7 @@ def project_mesh(mesh: Mesh, points: NDArray, device: Device) -> tuple[NDArray, 
     _, face = nearest_triangles(mesh.vertices, mesh.faces, local, device)
     vertices = mesh.vertices.astype(np.float64)
     corners = vertices[mesh.faces[face]]
-    foot = closest_on_triangles(local, corners)
+    foot = closest_point(corners, local)
     normal = _pseudonormals(vertices, np.asarray(mesh.faces, np.int64), face, _weights(foot, corners))
     apart = local - foot
     side = np.where(np.einsum("ij,ij->i", apart, normal) < 0, -1.0, 1.0)
@@ -39,19 +41,17 @@ def _weights(foot: NDArray, corners: NDArray) -> NDArray:
 
 def _pseudonormals(vertices, faces, face, weights) -> NDArray:
     """Return unit normals (n, 3) at points of faces: a face's own, at edges and vertices the pseudonormals."""
-    used = np.unique(faces[face])
+    welded = first_of_duplicates(vertices.astype(np.float32))[1][faces]  # seams of textures are no edges
     touched = np.zeros(len(vertices), bool)
-    touched[used] = True
-    near = np.flatnonzero(touched[faces].any(axis=1))  # faces that share a corner with one that counts
+    touched[welded[face]] = True
+    near = np.flatnonzero(touched[welded].any(axis=1))  # faces that share a corner with one that counts
     corners = vertices[faces[near]]
     own = np.full((len(faces), 3), np.nan)
     own[near] = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    place = _first_at_place(vertices, faces[near])
     normal = own[face]
     on_edge = weights < ON_EDGE
     edge = np.flatnonzero(on_edge.sum(axis=1) == 1)
     vertex = np.flatnonzero(on_edge.sum(axis=1) >= 2)
-    welded = place[faces]
     if len(edge):
         key = lambda of, k: (np.sort(np.stack([of[:, (k + 1) % 3], of[:, (k + 2) % 3]]), axis=0)  # noqa: E731
                              * np.array([[len(vertices)], [1]])).sum(axis=0)
@@ -61,29 +61,14 @@ def _pseudonormals(vertices, faces, face, weights) -> NDArray:
         mine = np.stack([key(welded[face[edge]], k) for k in range(3)])[opposite, np.arange(len(edge))]
         normal[edge] = sums[np.searchsorted(keys, mine)]
     if len(vertex):
-        angles = np.stack([_angles(corners, k) for k in range(3)], axis=1)
-        sums = _sums(np.nan_to_num((angles[:, :, None] * own[near][:, None]).reshape(-1, 3)), welded[near].ravel(),
-                     len(vertices))
+        by_angle = np.nan_to_num(angles(corners)[:, :, None] * own[near][:, None]).reshape(-1, 3)
+        sums = _sums(by_angle, welded[near].ravel(), len(vertices))
         corner = weights[vertex].argmax(axis=1)
         normal[vertex] = sums[welded[face[vertex], corner]]
     # Faces without an area, and opposite ones that cancel out, have no direction: any will do.
     out = _unit(normal)
     out[~np.isfinite(out).all(axis=1)] = (0, 0, 1)
     return out
-
-
-def _first_at_place(vertices, faces) -> NDArray:
-    """Return for each vertex (v,) the first of `faces`' vertices at the same place: seams of textures are no edges."""
-    used = np.unique(faces)
-    _, first, inverse = np.unique(vertices[used], axis=0, return_index=True, return_inverse=True)
-    place = np.arange(len(vertices))
-    place[used] = used[first[inverse.ravel()]]
-    return place
-
-
-def _angles(corners, k) -> NDArray:
-    a, b = (_unit(corners[:, (k + step) % 3] - corners[:, k]) for step in (1, 2))
-    return np.arccos(np.clip(np.nan_to_num(np.einsum("ij,ij->i", a, b)), -1, 1))
 
 
 def _sums(rows, index, count) -> NDArray:

@@ -68,24 +68,3 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
         out[start + order] = device.download(found, copy=False)[:len(local)]
         number[start + order] = kept[device.download(at, copy=False)[:len(local)]]
     return out * unit, number
-
-
-def closest_on_triangles(points: NDArray, corners: NDArray) -> NDArray:
-    """Return the nearest points (n, 3) of triangles (n, 3 corners, 3) to points (n, 3), float64."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    e, f, d = b - a, c - a, points - a
-    dot = lambda x, y: np.einsum("ij,ij->i", x, y)  # noqa: E731
-    ee, ff, ef, de, df = dot(e, e), dot(f, f), dot(e, f), dot(d, e), dot(d, f)
-    determinant = ee * ff - ef * ef
-    safe = lambda x: np.where(x > 0, x, 1)  # noqa: E731
-    v, w = (ff * de - ef * df) / safe(determinant), (ee * df - ef * de) / safe(determinant)
-    inside = (determinant > 1e-14 * ee * ff) & (v >= 0) & (w >= 0) & (v + w <= 1)
-    found = [a + np.where(inside, v, 0)[:, None] * e + np.where(inside, w, 0)[:, None] * f]
-    for p, q in ((a, b), (b, c), (c, a)):
-        edge = q - p
-        t = np.clip(dot(points - p, edge) / safe(dot(edge, edge)), 0, 1)
-        found.append(p + t[:, None] * edge)
-    found = np.stack(found)
-    gap = ((found - points) ** 2).sum(axis=2)
-    gap[0, inside] = -1
-    return found[gap.argmin(axis=0), np.arange(len(points))]

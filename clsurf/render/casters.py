@@ -66,10 +66,12 @@ def casters_of(device: Device, grid: Grid, scene, camera) -> Casters:
     return Casters(packets, singles, device.upload(view_floats(camera, grid.size)), device.upload(pixels))
 
 
-def fresh_mask(device: Device, scratch: Scratch, name: str, bins: int, words: int) -> DeviceArray:
-    """Return a mask (bins, words, 64) uint32 in which nothing is hidden."""
+def fresh_mask(device: Device, scratch: Scratch, casters: Casters, name: str, bins: int, words: int,
+               lamps: NDArray) -> DeviceArray:
+    """Return a mask (bins, words, 64) uint32 for `cast`: of nothing hidden, but where packets write all of it."""
     mask = scratch.array(name, (bins, words, 64), np.uint32)
-    device.fill(mask, 0)
+    if not casters.packets or not len(lamps):
+        device.fill(mask, 0)
     return mask
 
 

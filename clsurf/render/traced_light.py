@@ -33,7 +33,7 @@ def light_grid(device: Device, scratch: Scratch, grid: Grid, scene, camera, shad
     shadows = directions = hidden = scratch.array("no_bits", (1,), np.uint32)
     count = 0
     if shadowed:
-        shadows = fresh_mask(device, scratch, "shadows", bins, 1)
+        shadows = fresh_mask(device, scratch, casters, "shadows", bins, 1, own)
         cast(device, scratch, grid, casters, own, np.inf, shadows, 1, 0)
     if occluded:
         lights = sphere_lamps(shading.occlusion, camera)
@@ -43,7 +43,7 @@ def light_grid(device: Device, scratch: Scratch, grid: Grid, scene, camera, shad
         count = len(lights)
         directions = device.upload(lights)
         device.check_memory(hidden=8 * count * bins)
-        hidden = fresh_mask(device, scratch, "hidden", bins, count // 32)
+        hidden = fresh_mask(device, scratch, casters, "hidden", bins, count // 32, lights)
         reach = shading.occlusion_reach
         if reach is None:
             reach = REACH * float(np.linalg.norm(np.nan_to_num(scene.bounds[1] - scene.bounds[0], nan=np.inf)))

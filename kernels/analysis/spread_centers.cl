@@ -14,8 +14,7 @@
 __kernel void spread_centers(int cells, int first, __global const int *cell_start, __global const int *cell_end,
                              __global const float *spacing, int padded, __global const float *sorted,
                              __global const float *boxes, __global const int *node_offset, int top_level,
-                             __global uchar *covered,
-                             __global uchar *chosen) {
+                             __global uchar *covered, __global uchar *chosen) {
   int cell = get_global_id(0);
   if (cell >= cells) return;
   size_t n = padded, n16 = padded / 16;
