@@ -12,6 +12,7 @@ from clsurf.render.camera import Camera
 from clsurf.render.renderer import Renderer
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
+from clsurf.surface.surfel import SurfelHierarchy
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,29 @@ def test_ray_surfels(form, ring):
     assert (hits.primitive[both] == number[both]).mean() > 0.99
     near = trace(ring, origins, directions, "any", device=form)
     assert (near.hit == hits.hit).all()
+
+
+def plates(apart, radius):
+    """Two base surfels, seen from above: one from behind in the plane z = 0, the other `apart` below it."""
+    one, flat = np.ones(2, np.int32), np.zeros(2, np.float32)
+    return SurfelHierarchy(np.array([[0, 0, 0], [0, 0, -apart]]), np.array([[0, 0, -1.0], [0, 0, 1]]),
+                           np.full(2, radius), np.full(2, radius), flat, flat, one, np.zeros(3), np.zeros(0),
+                           np.arange(2), one, np.array([[128, 128, 0, 255], [128, 128, 255, 255]]))
+
+
+@pytest.mark.parametrize("radius", (1.0, 0.5))
+def test_discs_seen_from_behind_are_set_back(form, radius):
+    """By a quarter of their radius, and no more: what faces the eye less far behind them is seen in their place."""
+    cameras = (Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 20),
+               Camera.orthographic((0, 0, 4), (0, 0, 0), (0, 1, 0), 1.0))
+    for part, seen in ((0.2, 1), (0.3, 0)):
+        surface, wanted = plates(part * radius, radius), (4.0, 4 + part * radius)[seen]
+        for camera in cameras:
+            with Renderer(form, lanes=form.lanes) as renderer:
+                frame = renderer.render(surface, camera, (9, 9), ("depth", "normal"))
+            assert frame.depth[4, 4] == pytest.approx(wanted, abs=1e-5) and frame.normal[4, 4, 2] > 0.99
+        hit = trace(surface, (0.01, 0.02, 4), (0, 0, -1), device=form)
+        assert hit.distance == pytest.approx(wanted, abs=1e-5) and hit.primitive == seen
 
 
 def test_rays_on_a_sphere(form, ball):
