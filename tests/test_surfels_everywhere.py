@@ -12,7 +12,7 @@ from clsurf.render.camera import Camera
 from clsurf.render.renderer import Renderer
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
-from clsurf.surface.surfel import SurfelHierarchy
+from clsurf.surface.surfel import SurfelHierarchy, encoded_normals
 
 
 @pytest.fixture(scope="module")
@@ -64,27 +64,40 @@ def test_ray_surfels(form, ring):
     assert (near.hit == hits.hit).all()
 
 
-def plates(apart, radius):
-    """Two base surfels, seen from above: one from behind in the plane z = 0, the other `apart` below it."""
-    one, flat = np.ones(2, np.int32), np.zeros(2, np.float32)
-    return SurfelHierarchy(np.array([[0, 0, 0], [0, 0, -apart]]), np.array([[0, 0, -1.0], [0, 0, 1]]),
-                           np.full(2, radius), np.full(2, radius), flat, flat, one, np.zeros(3), np.zeros(0),
-                           np.arange(2), one, np.array([[128, 128, 0, 255], [128, 128, 255, 255]]))
+def plates(apart, radius, facing=(-1, 1), aside=0.0):
+    """Two base surfels, at zero and `apart` below and `aside` of it; `facing` 1: their fronts are seen from above."""
+    one, flat, normals = np.ones(2, np.int32), np.zeros(2, np.float32), np.array([[0, 0, f] for f in facing])
+    positions, radii = np.array([[0, 0, 0], [aside, 0, -apart]]), np.full(2, radius)
+    atlas = np.pad(encoded_normals(normals), ((0, 0), (0, 1)), constant_values=255)
+    return SurfelHierarchy(positions, normals, radii, radii, flat, flat, one, np.zeros(3), np.zeros(0), np.arange(2),
+                           one, atlas)
+
+
+def seen_from_above(surface, x, device):
+    """Depth and normal's z seen from (x, 0, 4): perspective, orthographic, and by a ray."""
+    eye, at = np.array([x, 0, 4.0]), np.array([x, 0, 0.0])
+    for camera in (Camera.look_at(eye, at, (0, 1, 0), 20), Camera.orthographic(eye, at, (0, 1, 0), 1.0)):
+        with Renderer(device, lanes=device.lanes) as renderer:
+            frame = renderer.render(surface, camera, (9, 9), ("depth", "normal"))
+        yield frame.depth[4, 4], frame.normal[4, 4, 2]
+    hit = trace(surface, eye, (0, 0, -1), device=device)
+    yield (hit.distance, hit.normal[2]) if hit.hit else (np.nan, np.nan)
 
 
 @pytest.mark.parametrize("radius", (1.0, 0.5))
 def test_discs_seen_from_behind_are_set_back(form, radius):
     """By a quarter of their radius, and no more: what faces the eye less far behind them is seen in their place."""
-    cameras = (Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 20),
-               Camera.orthographic((0, 0, 4), (0, 0, 0), (0, 1, 0), 1.0))
-    for part, seen in ((0.2, 1), (0.3, 0)):
-        surface, wanted = plates(part * radius, radius), (4.0, 4 + part * radius)[seen]
-        for camera in cameras:
-            with Renderer(form, lanes=form.lanes) as renderer:
-                frame = renderer.render(surface, camera, (9, 9), ("depth", "normal"))
-            assert frame.depth[4, 4] == pytest.approx(wanted, abs=1e-5) and frame.normal[4, 4, 2] > 0.99
-        hit = trace(surface, (0.01, 0.02, 4), (0, 0, -1), device=form)
-        assert hit.distance == pytest.approx(wanted, abs=1e-5) and hit.primitive == seen
+    for part, wanted in ((0.2, 4 + 0.2 * radius), (0.3, 4.0)):
+        for depth, z in seen_from_above(plates(part * radius, radius), 0.0, form):
+            assert depth == pytest.approx(wanted, abs=1e-5) and z > 0.99
+
+
+@pytest.mark.parametrize(("x", "facing", "wanted"), [(0.8, (1, -1), 4.0), (0.9, (1, -1), 4.0), (0.9, (1, 1), 5.0),
+                                                     (0.9, (-1, -1), 5.0), (0.8, (-1, -1), 4.0)])
+def test_no_inside_is_seen_past_the_inner_part_of_a_disc(form, x, facing, wanted):
+    """The inner 0.85 of a disc hide all; the rest blends, and hides discs that are seen from behind."""
+    for depth, z in seen_from_above(plates(1.0, 1.0, facing, 0.5), x, form):
+        assert depth == pytest.approx(wanted, abs=1e-5) and z > 0.99
 
 
 def test_rays_on_a_sphere(form, ball):

@@ -20,7 +20,7 @@ from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, view_floats
 from .triangles import Triangles, draw_triangles, place_triangles
 
 SURFEL_FLOATS, RECORD_FLOATS = 16, 32  # kernels/common/surfel.clh
-IS_BASE, IS_ROOT, IS_COVERED, HAS_TRIANGLES = 0x100, 0x200, 0x400, 0x800
+IS_BASE, IS_ROOT, HAS_TRIANGLES = 0x100, 0x200, 0x800
 DRAWN, BY_TRIANGLES = 2, 3
 # Discs blend where their planes are less than so many radii apart, plus the relief below them. Neighbours on a bend of
 # the surface of two radii are 1/4 apart.
@@ -71,7 +71,7 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
     root = np.ones(n, bool)
     root[surface.children] = False
     base = below == 0
-    flags = surface.map_size.astype(np.int32) | IS_ROOT * root | IS_COVERED * covered_maps(surface)
+    flags = surface.map_size.astype(np.int32) | IS_ROOT * root
     if surface.hybrid:
         own = np.diff(surface.triangle_offset) > 0
         flags |= HAS_TRIANGLES * own
@@ -97,8 +97,11 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
         colors[:, :3] = LINEAR_OF_BYTE[surface.colors[:, :3]]
     atlas = lambda texels: device.upload(np.ascontiguousarray(texels).view(np.uint32).ravel())  # noqa: E731
     values = np.unique(surface.level)
+    surfels, normal_atlas = device.upload(records), atlas(surface.normal_atlas)
+    device.kernel("render/plain_cosines.cl", constants={"VW": device.lanes})(
+        (n,), (min(64, n),), n, normal_atlas, surfels)
     return SurfelUpload(
-        n, device.upload(records), root.astype(np.uint8), atlas(surface.normal_atlas),
+        n, surfels, root.astype(np.uint8), normal_atlas,
         None if surface.color_atlas is None else atlas(surface.color_atlas),
         None if colors is None else device.upload(colors), device.upload(surface.level),
         np.concatenate([[0], np.searchsorted(surface.level, values, side="right")]), surface.radii, surface.origin,
@@ -116,24 +119,6 @@ def below_of(device: Device, surface: SurfelHierarchy) -> tuple:
     faces = np.where(finite[surface.triangles].all(axis=1)[:, None], surface.triangles, 0)  # one vertex: not drawn
     triangles = Triangles(fours(surface.vertices), device.upload(faces[:1]), fours(surface.vertex_normals), light)
     return surface.triangle_offset, faces, triangles
-
-
-def covered_maps(surface: SurfelHierarchy) -> NDArray:
-    """Return whether every texel that a surfel's disc touches is covered, (n,) bool."""
-    out = np.zeros(len(surface), bool)
-    covered = surface.normal_atlas[:, 3] > 0
-    for size in np.unique(surface.map_size):
-        edge = 2 * np.arange(size + 1) / size - 1
-        least = np.where(edge[:-1] * edge[1:] <= 0, 0, np.minimum(np.abs(edge[:-1]), np.abs(edge[1:])))
-        touched = np.flatnonzero((least[:, None]**2 + least**2 < 1).ravel())
-        own = np.flatnonzero(surface.map_size == size)
-        first, runs = surface.map_offset[own], np.diff(surface.map_offset[own])
-        if len(own) and (runs == size * size).all():  # maps stand together: a view of rows
-            rows = covered[first[0]:first[0] + len(own) * size * size].reshape(len(own), -1)
-            out[own] = rows.all(axis=1) if len(touched) == size * size else rows[:, touched].all(axis=1)
-        else:
-            out[own] = covered[first[:, None] + touched].all(axis=1)
-    return out
 
 
 def place_surfels(upload: SurfelUpload, matrix: NDArray | None, camera, size, lod: float) -> NDArray:

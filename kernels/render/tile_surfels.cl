@@ -1,7 +1,8 @@
 // Draw the surfels of every bin into its depth and attribute planes: perspective-correct discs, normals from their maps.
 //
 // Pass 1 finds the frontmost disc of every pixel; of a base surfel its inner part counts, of an inner surfel where its
-// map is covered, which trims silhouettes and holes. Pass 2 blends what lies about as deep and is seen from the same
+// map is covered, which trims silhouettes and holes. Where that is seen from behind and the rest of a disc seen from its
+// front lies before it, the latter is taken: a closed surface shows its inside through gaps only. Pass 2 blends what lies about as deep and is seen from the same
 // side, weighted by (1 - t^2)^3, which is close to a Gaussian of the distance t from the disc's middle over its radius.
 //
 // VW > 1: one work-item per tile of TILE_BINS^2 bins, lanes over blocks of 4x4 pixels (8 lanes: 4x2, 4: 4x1).
@@ -21,11 +22,6 @@
 #endif
 #ifndef MAPS
 #define MAPS 1        // 0: every surfel is a whole disc with one normal, as in QSplat
-#endif
-#ifndef TRIM
-// Of the disc's facing that a texel's normal must have to be seen. Dragon 1024x1024, surfels up to 16 pixels, 0 and 0.5:
-// 2239 and 735 pixels outside of the finest level's outline, RMS of the angle to its normals 4.69 and 3.13 degrees.
-#define TRIM 0.5f
 #endif
 #ifndef COLOR_MAPS
 #define COLOR_MAPS 0
@@ -95,7 +91,8 @@ INLINE VI texels_at(__global const float *k, VF u, VF v, VF inverse) {
 // (rx, ry, rz) are the rays, model space. Of private pairs those remain whose discs lie over a pixel, `*total` of them.
 INLINE int frontmost(PAIRS pairs, int *total, uint block, float bucket, __global const float *records,
                      __global const uint *atlas, VF px, VF py, VF rx, VF ry, VF rz, VF smallest, VF largest,
-                     VF *best, VF *at, VF *facing, VI *nearest, int *cost) {
+                     VF *best, VF *at, VF *facing, VI *nearest, VF *whole /* frontmost disc seen from its front, rest and
+                     all */, VI *whole_nearest, int *cost) {
   int more = 1, count = *total, kept = 0;
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
@@ -112,19 +109,23 @@ INLINE int frontmost(PAIRS pairs, int *total, uint block, float bucket, __global
     VF key = where;
     if (k[FACE] < 0.0f) key = IS_PERSPECTIVE ? where - k[BIAS] * where * where : where - k[BIAS];
     VI good = (away2 < k[CORE2] * one) & (where < largest) & (key > *best);
+    VI some = (away2 < one) & (where < largest) & (where > *whole);
     if (IS_PERSPECTIVE) good = good & (where > 0.0f);
 #if CLIP_PLANES
     good = good & (where > smallest);
+    some = some & (where > smallest);
 #endif
-    if (!any_lane(good)) continue;
+    if (k[FACE] < 0.0f) some = (VI)(0);
+    if (!any_lane(good | some)) continue;
     if (MAPS && !(as_int(k[FLAGS]) & IS_PLAIN)) {
       VF inverse = IS_PERSPECTIVE ? 1.0f / where : (VF)(1.0f);
-      VU code = gather_words(atlas, SEL((VI)(as_int(k[MAP])), texels_at(k, u, v, inverse), good));
+      VU code = gather_words(atlas, SEL((VI)(as_int(k[MAP])), texels_at(k, u, v, inverse), good | some));
       good = good & (AS_VI(code) < 0);  // the highest bit: covered
       // Past its silhouette the surface has bent away below the disc, which there is seen beside it: of a round surface
       // from where its normal faces the eye half as much as the disc's.
       VF nx, ny, nz;
       decode_normal(code, &nx, &ny, &nz);
+      some = some & (AS_VI(code) < 0) & (nx * rx + ny * ry + nz * rz < 0.0f);
       nx -= TRIM * k[NX]; ny -= TRIM * k[NY]; nz -= TRIM * k[NZ];
       good = good & (k[FACE] * (nx * rx + ny * ry + nz * rz) < 0.0f);
     }
@@ -133,7 +134,9 @@ INLINE int frontmost(PAIRS pairs, int *total, uint block, float bucket, __global
     *facing = SEL(*facing, (VF)(k[FACE]), good);
 #if FIELD_LEVEL >= 0
     *nearest = SEL(*nearest, (VI)(as_int(k[ID])), good);
+    *whole_nearest = SEL(*whole_nearest, (VI)(as_int(k[ID])), some);
 #endif
+    *whole = SEL(*whole, where, some);
   }
   *total = kept;
   return more;
@@ -219,7 +222,8 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
   if (IS_PERSPECTIVE) { rx = (px - view[CX]) * (1.0f / view[FX]); ry = (view[CY] - py) * (1.0f / view[FY]); }
   VF ray_x = view[0] * rx + view[3] * ry - view[6], ray_y = view[1] * rx + view[4] * ry - view[7];
   VF ray_z = view[2] * rx + view[5] * ry - view[8];
-  VI nearest = 0;
+  VF whole = IS_PERSPECTIVE ? 0.0f : -infinite;
+  VI nearest = 0, whole_nearest = 0;
   int cost = 0;
   Blend sum;
   sum.weight = sum.depth = sum.x = sum.y = sum.z = sum.red = sum.green = sum.blue = 0.0f;
@@ -227,16 +231,20 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
 #if VW == 1
   int all = count;
   frontmost(pairs, &all, 1u << quarter, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest,
-            largest, &best, &first, &facing, &nearest, &cost);
+            largest, &best, &first, &facing, &nearest, &whole, &whole_nearest, &cost);
 #else
   uint2 kept[SEGMENT];
   int more = 1, n = 0;
   for (int from = 0; from < count && more; from += SEGMENT) {
     n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
     more = frontmost(kept, &n, 0u, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest, largest,
-                     &best, &first, &facing, &nearest, &cost);
+                     &best, &first, &facing, &nearest, &whole, &whole_nearest, &cost);
   }
 #endif
+  VI through = (facing < 0.0f) & (whole > first);
+  first = SEL(first, whole, through);
+  facing = SEL(facing, (VF)(1.0f), through);
+  nearest = SEL(nearest, whole_nearest, through);
   VI found = facing != 0.0f;
   if (was_touched && !any_lane(found)) return cost;
   if (!any_lane(found)) { store_plane(planes, FIELD_DEPTH, at, before); return cost; }
