@@ -135,10 +135,10 @@ def select_surfels(surface, view, lod, interior):
     for i in range(n):
         if not state[i]:
             continue
-        if out[i]:
-            state[i] = 0
-        elif base[i] or (small[i] and lod > 0):
+        if base[i] or (not out[i] and small[i] and lod > 0):
             state[i] = 2
+        elif out[i]:
+            state[i] = 0
         else:
             for c in range(surface.child_offset[i], surface.child_offset[i + 1]):
                 state[surface.children[c]] = 1
