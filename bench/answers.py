@@ -86,6 +86,11 @@ def job(function):
     return function
 
 
+def forms(device) -> tuple[int, ...]:
+    """Return the lanes of the forms of the kernels that are run: 16 and single items, or those alone (llvmpipe)."""
+    return (1,) if device.lanes == 1 and device.kind == "cpu" else (16, 1)
+
+
 def camera(size: Size):
     """Return the camera of every picture: the torus from above, with some of its inside."""
     return clsurf.Camera.look_at((1.3, -2.2, 2.4), (0, 0, 0), up=(0, 0, 1), fov=40)
@@ -135,7 +140,7 @@ def draw_slim(device, size, made):
     out, plain = {}, ("color", "depth", "normal", "position", "id", "count", "level", "cost")
     second = ("mean", "gaussian", "k1", "k2", "direction1", "direction2", "radial")
     third = ("derivative1", "derivative2", "radial_derivative")
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             for degree in (1, 2, 3):
                 extra = () if degree == 1 else second if degree == 2 else (*second, *third)
@@ -161,7 +166,7 @@ def draw_patches(device, size, made):
              "gouraud": {"shading": "gouraud"}, "table": {"normal_table": True}, "ordered": {"normal_table": "ordered"},
              "alpha": {"alpha": True}, "culled": {"cull": True}, "smooth_normals": {"normals": "smooth"}}
     out = {}
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             for name, options in modes.items():
                 frame = renderer.render(made["patches"], camera(size), size.picture,
@@ -199,7 +204,7 @@ def draw_others(device, size, made):
     things = {name: made[name] for name in ("surfels", "hybrid", "scale_map")}
     things |= {"mesh": given["mesh"], "cloud": given["cloud"], "bare": clsurf.PointCloud(given["cloud"].points)}
     channels = ("color", "depth", "normal", "position", "id", "count", "level", "cost")
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             for name, thing in things.items():
                 frame = renderer.render(thing, camera(size), size.picture, channels)
@@ -223,7 +228,7 @@ def materials(device, size, made):
     names, out = ("slim2", "patches", "surfels", "scale_map"), {}
     scene = clsurf.Scene([made[name].moved(raised(0.6 * i)) for i, name in enumerate(names)], lights=lamps,
                          materials=looks)
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.lit, ("color",), background="sky",
                                                     shading=clsurf.Shading(occlusion=32)).color
@@ -237,7 +242,7 @@ def light(device, size, made):
     shading = clsurf.Shading(shadows=True, occlusion=32, mirror=0.3)
     scene = clsurf.Scene([made["slim2"], made["patches"].moved(raised(0.7))], lights=lamps)
     out = {}
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.lit, ("color",),
                                                     shading=shading).color
