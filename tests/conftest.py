@@ -37,6 +37,13 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if item not in left_out]
 
 
+@pytest.fixture(params=[16, 8, 4, 1])
+def lanes(request, device, monkeypatch):
+    """Both kernel forms, and narrower vectors."""
+    monkeypatch.setattr(device, "lanes", request.param)
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def renderers(device):
     """Renderers in both kernel forms, and one of small tiles."""

@@ -31,6 +31,7 @@ SPACINGS = (1.0, 0.5, 0.4, 0.3, 0.2)
 RECORD = 16  # floats a fitted surfel (fit_surfels.cl)
 BOUND_SHARE = 0.999  # of the scan's points lie within `bound` of the surface
 BOUND_SAMPLES = 1 << 16  # points that the bound is taken from
+ROUNDING = 2.0**-22  # diagonals: positions of a model in float32, and of what is drawn
 SEGMENT, FORCED, FIXED = 0, 1, 2  # modes of fit_surfels.cl
 
 
@@ -195,7 +196,7 @@ def surfel_colors(tree: PointTree, center: NDArray, record: NDArray, colors: NDA
 
 
 def with_bound(surface: SlimSurface, tree: PointTree, middle: NDArray) -> SlimSurface:
-    """Return `surface` with the distance that BOUND_SHARE of the scan's points keep, from an even sample of them."""
+    """Return `surface` with the distances that BOUND_SHARE and all of an even sample of the scan's points keep."""
     device = tree.device
     blocks = tree.padded // BLOCK
     wanted = min(blocks, BOUND_SAMPLES // BLOCK)
@@ -208,4 +209,4 @@ def with_bound(surface: SlimSurface, tree: PointTree, middle: NDArray) -> SlimSu
     result = project_sorted(leaves, device.upload(queries), queries.shape[1], queries.shape[1])
     distance = np.abs(device.download(result, copy=False)[6, real])
     return replace(surface, bound=float(np.quantile(distance, BOUND_SHARE)) * surface.diagonal,
-                   bound_share=BOUND_SHARE)
+                   bound_share=BOUND_SHARE, bound_all=float(distance.max() + ROUNDING) * surface.diagonal)

@@ -45,7 +45,7 @@ class StoredSurface:
 
     Attributes
     ----------
-    degree, error, diagonal, bound, bound_share
+    degree, error, diagonal, bound, bound_share, bound_all
         As those of `SlimSurface`.
     part_bounds : (k, 2, 3) float64
         World boxes of the parts; part 0 holds the coarse levels of all.
@@ -82,7 +82,8 @@ class StoredSurface:
     def _describe(self) -> None:
         values = self._values
         self.degree, self.error, self.diagonal = int(values["degree"]), values["error"], float(values["diagonal"])
-        self.bound = float("nan") if values.get("bound") is None else float(values["bound"])
+        self.bound, self.bound_all = (float("nan") if values.get(name) is None else float(values[name])
+                                      for name in ("bound", "bound_all"))
         self.bound_share = float(values.get("bound_share", 1.0))
         if self._single:
             whole = self.read(0)
