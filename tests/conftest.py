@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.answers import forms
+from bench.answer_scenes import forms
 from clsurf.device import open_device
 from clsurf.render.renderer import Renderer
 
