@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import clsurf
-from bench.answers import torus_mesh
+from bench.answer_scenes import torus_mesh
 
 CLASSES = [thing for name in clsurf.__all__ if inspect.isclass(thing := getattr(clsurf, name))]
 FUNCTIONS = [thing for name in clsurf.__all__ if inspect.isfunction(thing := getattr(clsurf, name))]

@@ -1,5 +1,7 @@
 """Scale maps in the renderer: exact spheres, orders, points on the map itself, both forms, near plane, scenes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import scan_path
@@ -11,9 +13,10 @@ from clsurf import Camera, ScaleMapDrawing, Scene
 from clsurf.errors import InputError
 from clsurf.render.renderer import Renderer
 from clsurf.render.scale_map import cells_of, upload_scale_map
-from clsurf.surface.cube import texel_directions
+from clsurf.surface.cube import border_directions, texel_directions
 from clsurf.surface.geosphere import geosphere_directions
 from clsurf.surface.scale_map import ScaleMap, encoded_normals
+from clsurf.surface.slim import frame_of_normals
 
 SIZE = (96, 72)
 ALL = ("color", "depth", "normal", "position", "id", "count", "level", "cost")
@@ -238,6 +241,33 @@ def test_scale_normals(device):
         exact.append((off[:, 1:-1, 1:-1].max(), off.max()))
         assert np.median(off) < 0.7 * np.median(rough)
     assert (np.log2(np.divide(exact[:-1], exact[1:])) > 1.9).all(), exact
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_scale_normals_follow_quadratics_exactly(device, monkeypatch, lanes):
+    """Of rho = 1 + g.(x, y) + a quadratic form about a texel, the fit finds g whatever the form: mixed term, edges,
+    corners and holes among the texels around it."""
+    from clsurf.render.scale_map import scale_normals
+    monkeypatch.setattr(device, "lanes", lanes)
+    surface, size = twin.smooth_map(6), 6
+    upload, around = upload_scale_map(device, surface), border_directions(size)
+    gx, gy, off = 0.3, -0.2, {}
+    for form, terms in {"square": (1.5, 0, -2.0), "mixed": (0, 2.5, 0), "all": (-1.0, 2.0, 1.5)}.items():
+        for face, row, column in ((0, 2, 3), (3, 0, 2), (4, 3, 5), (2, 0, 0), (5, 5, 0)):
+            d = texel_directions(size)[face, row, column]
+            u, v = frame_of_normals(d)
+            along = around @ d
+            x, y = around @ u / along, around @ v / along
+            rho = 1 + gx * x + gy * y + terms[0] * x * x + terms[1] * x * y + terms[2] * y * y
+            rho = np.where((along > 0.5) & (rho > 0), rho, -1)
+            hole = (face, row, column + 1)
+            wanted = unit(d - gx * u - gy * v)
+            for holes in (False, True):
+                rho[hole] = -1 if holes else rho[hole]
+                own = replace(upload, rho=device.upload(np.ascontiguousarray(rho[None], np.float32)))
+                got = scale_normals(device, own, 0, ScaleMapDrawing(normals="gradient"))[face, row, column, :3]
+                off[form, face, row, column, holes] = np.linalg.norm(got - wanted)
+    assert max(off.values()) < 1e-4, off
 
 
 @pytest.mark.parametrize("lanes", (16, 1))

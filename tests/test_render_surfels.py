@@ -59,6 +59,24 @@ def test_select_surfels(lanes, device, ring):
     assert states == {0, 1, 2}
 
 
+@pytest.mark.parametrize("lanes", LANES)
+def test_plain_cosines(lanes, device, ring, monkeypatch):
+    """Of sound maps, of sizes that lanes do not divide, and of maps with a texel that is not covered or turned away."""
+    monkeypatch.setattr(device, "lanes", lanes)
+    odd = build_surfels(sphere(400), map_size=5, device=device)
+    for surface in (ring, odd):
+        inner = np.flatnonzero(surface.map_size > 1)
+        atlas = surface.normal_atlas.copy()
+        for k, texel in enumerate(np.random.default_rng(0).integers(0, surface.map_size[0] ** 2, 9)):
+            at = surface.map_offset[inner[-1 - k]] + texel  # of the corners, none matters
+            atlas[at] = (*atlas[at, :3], 0) if k % 2 else (*(255 - atlas[at, :3]), 255)
+        surface = dataclasses.replace(surface, normal_atlas=atlas)
+        got = device.download(upload_surfels(device, surface).surfels)[inner, 11]
+        wanted = np.array([twin.plain_cosine(surface, s) for s in inner])
+        np.testing.assert_allclose(got, wanted, atol=2e-4)
+        assert 4 < (got == 2).sum() < len(got) - 20
+
+
 @pytest.mark.parametrize("number", range(3))
 @pytest.mark.parametrize("maps", (True, False))
 def test_tile_surfels(number, maps, device, ring, renderers):

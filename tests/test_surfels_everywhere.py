@@ -12,6 +12,7 @@ from clsurf.render.camera import Camera
 from clsurf.render.renderer import Renderer
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
+from clsurf.surface.surfel import SurfelHierarchy, encoded_normals
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,42 @@ def test_ray_surfels(form, ring):
     assert (hits.primitive[both] == number[both]).mean() > 0.99
     near = trace(ring, origins, directions, "any", device=form)
     assert (near.hit == hits.hit).all()
+
+
+def plates(apart, radius, facing=(-1, 1), aside=0.0):
+    """Two base surfels, at zero and `apart` below and `aside` of it; `facing` 1: their fronts are seen from above."""
+    one, flat, normals = np.ones(2, np.int32), np.zeros(2, np.float32), np.array([[0, 0, f] for f in facing])
+    positions, radii = np.array([[0, 0, 0], [aside, 0, -apart]]), np.full(2, radius)
+    atlas = np.pad(encoded_normals(normals), ((0, 0), (0, 1)), constant_values=255)
+    return SurfelHierarchy(positions, normals, radii, radii, flat, flat, one, np.zeros(3), np.zeros(0), np.arange(2),
+                           one, atlas)
+
+
+def seen_from_above(surface, x, device):
+    """Depth and normal's z seen from (x, 0, 4): perspective, orthographic, and by a ray."""
+    eye, at = np.array([x, 0, 4.0]), np.array([x, 0, 0.0])
+    for camera in (Camera.look_at(eye, at, (0, 1, 0), 20), Camera.orthographic(eye, at, (0, 1, 0), 1.0)):
+        with Renderer(device, lanes=device.lanes) as renderer:
+            frame = renderer.render(surface, camera, (9, 9), ("depth", "normal"))
+        yield frame.depth[4, 4], frame.normal[4, 4, 2]
+    hit = trace(surface, eye, (0, 0, -1), device=device)
+    yield (hit.distance, hit.normal[2]) if hit.hit else (np.nan, np.nan)
+
+
+@pytest.mark.parametrize("radius", (1.0, 0.5))
+def test_discs_seen_from_behind_are_set_back(form, radius):
+    """By a quarter of their radius, and no more: what faces the eye less far behind them is seen in their place."""
+    for part, wanted in ((0.2, 4 + 0.2 * radius), (0.3, 4.0)):
+        for depth, z in seen_from_above(plates(part * radius, radius), 0.0, form):
+            assert depth == pytest.approx(wanted, abs=1e-5) and z > 0.99
+
+
+@pytest.mark.parametrize(("x", "facing", "wanted"), [(0.8, (1, -1), 4.0), (0.9, (1, -1), 4.0), (0.9, (1, 1), 5.0),
+                                                     (0.9, (-1, -1), 5.0), (0.8, (-1, -1), 4.0)])
+def test_no_inside_is_seen_past_the_inner_part_of_a_disc(form, x, facing, wanted):
+    """The inner 0.85 of a disc hide all; the rest blends, and hides discs that are seen from behind."""
+    for depth, z in seen_from_above(plates(1.0, 1.0, facing, 0.5), x, form):
+        assert depth == pytest.approx(wanted, abs=1e-5) and z > 0.99
 
 
 def test_rays_on_a_sphere(form, ball):

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ..device.arrays import DeviceArray
 from ..surface.slim import COEFFICIENTS, SlimSurface, segment_end
 from ..surface.srgb import premultiplied, straight
-from .point_tree import BLOCK, FAR_POINT, PointTree
+from .point_tree import BLOCK, FAR_POINT, PointTree, lane_form
 from .project import leaf_tree, project_sorted
 from .radius import Noise
 
@@ -82,7 +82,7 @@ def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, rep
     need = min(2 * min(terms, COEFFICIENTS[2]) + 2, tree.count)  # fewer over-fit; cubics become quadratics before
     choose = device.kernel("build/choose_centers.cl")
     weighted = {"WEIGHTED": 1} if tree.weighted else {}
-    fit = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree, **weighted})
+    fit = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree, **lane_form(device), **weighted})
     cover = device.kernel("build/cover_points.cl")
     mark_open = device.kernel("build/open_points.cl")
     blocks = tree.padded // BLOCK

@@ -20,8 +20,8 @@ from .tiles import Footprints, Grid, PairLists, Scratch, bin_pairs, view_floats
 from .triangles import Triangles, draw_triangles, place_triangles
 
 SURFEL_FLOATS, RECORD_FLOATS = 16, 32  # kernels/common/surfel.clh
-IS_BASE, IS_ROOT, IS_COVERED, HAS_TRIANGLES = 0x100, 0x200, 0x400, 0x800
-DRAWN, BY_TRIANGLES = 2, 3
+IS_BASE, IS_ROOT, IS_LAST, HAS_TRIANGLES = 0x100, 0x200, 0x400, 0x800
+VISITED, DRAWN, BY_TRIANGLES = 1, 2, 3
 # Discs blend where their planes are less than so many radii apart, plus the relief below them. Neighbours on a bend of
 # the surface of two radii are 1/4 apart.
 SLAB = 0.3
@@ -34,12 +34,12 @@ class SurfelUpload:
 
     count: int
     surfels: DeviceArray  # (count, 16) float32
-    state: NDArray  # (count,) uint8 at the start of the search: the roots are visited
+    state: NDArray  # (count,) uint8 at the start of the search: the roots are visited, or drawn
     atlas: DeviceArray  # (texels,) uint32
     color_atlas: DeviceArray | None
     colors: DeviceArray | None  # (count, 4) float32, linear
     levels: DeviceArray  # (count,) int32
-    level_end: NDArray  # (levels + 1,) surfels of levels[0:i] end at level_end[i]
+    level_end: NDArray  # (k + 1,) surfels of levels[0:i] end at level_end[i]; the levels that have to be looked at
     radii: NDArray  # (count,) float32
     origin: NDArray  # (3,) float64
     slabs: NDArray  # (count,) float32, model units: kernels/common/surfel.clh, S_SLAB
@@ -67,16 +67,7 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
                         colors=0 if surface.colors is None else 16 * n)
     usable = (np.isfinite(surface.positions).all(axis=1) & np.isfinite(surface.normals).all(axis=1)
               & np.isfinite(surface.radii) & (surface.radii > 0))
-    below = np.diff(surface.child_offset)
-    root = np.ones(n, bool)
-    root[surface.children] = False
-    base = below == 0
-    flags = surface.map_size.astype(np.int32) | IS_ROOT * root | IS_COVERED * covered_maps(surface)
-    if surface.hybrid:
-        own = np.diff(surface.triangle_offset) > 0
-        flags |= HAS_TRIANGLES * own
-        base &= ~own
-    flags |= IS_BASE * base
+    flags, state, level_end = ways_down(surface)
     records = np.zeros((n, SURFEL_FLOATS), np.float32)
     radius = np.where(usable, surface.radii, 0)
     columns = [*surface.positions.T, radius, *surface.normals.T, surface.spreads, surface.heights, surface.spheres,
@@ -87,7 +78,8 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
     whole = records.view(np.int32)
     whole[:, 12], whole[:, 13] = surface.map_offset, flags
     child = np.append(surface.children, 0)
-    whole[:, 14], whole[:, 15] = child[np.minimum(surface.child_offset[:-1], len(child) - 1)], below
+    whole[:, 14] = child[np.minimum(surface.child_offset[:-1], len(child) - 1)]
+    whole[:, 15] = np.diff(surface.child_offset)
     points = surface.positions[usable].astype(np.float64)
     center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
     reach = float((np.linalg.norm(points - center, axis=1) + surface.radii[usable]).max()) if len(points) else 0.0
@@ -96,13 +88,36 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
         colors = np.ones((n, 4), np.float32)
         colors[:, :3] = LINEAR_OF_BYTE[surface.colors[:, :3]]
     atlas = lambda texels: device.upload(np.ascontiguousarray(texels).view(np.uint32).ravel())  # noqa: E731
-    values = np.unique(surface.level)
+    surfels, normal_atlas = device.upload(records), atlas(surface.normal_atlas)
+    device.kernel("render/plain_cosines.cl", constants={"VW": device.lanes})(
+        (n,), (min(64, n),), n, normal_atlas, surfels)
     return SurfelUpload(
-        n, device.upload(records), root.astype(np.uint8), atlas(surface.normal_atlas),
+        n, surfels, state, normal_atlas,
         None if surface.color_atlas is None else atlas(surface.color_atlas),
-        None if colors is None else device.upload(colors), device.upload(surface.level),
-        np.concatenate([[0], np.searchsorted(surface.level, values, side="right")]), surface.radii, surface.origin,
-        np.ascontiguousarray(records[:, 10]), center, reach, *below_of(device, surface))
+        None if colors is None else device.upload(colors), device.upload(surface.level), level_end, surface.radii,
+        surface.origin, np.ascontiguousarray(records[:, 10]), center, reach, *below_of(device, surface))
+
+
+def ways_down(surface: SurfelHierarchy) -> tuple[NDArray, NDArray, NDArray]:
+    """Return flags and first state of all surfels, and the ends of the levels that the search has to look at."""
+    n, below = len(surface), np.diff(surface.child_offset)
+    root, direct = np.ones(n, bool), np.zeros(n, bool)
+    root[surface.children] = False
+    base = below == 0
+    flags = surface.map_size.astype(np.int32) | IS_ROOT * root
+    if surface.hybrid:
+        own = np.diff(surface.triangle_offset) > 0
+        flags |= HAS_TRIANGLES * own
+        base &= ~own
+    bases = np.concatenate([[0], np.cumsum(base[surface.children])])
+    last = (below > 0) & (np.diff(bases[surface.child_offset]) == below)
+    direct[surface.children] = np.repeat(last, below)
+    direct |= root & base
+    flags |= IS_BASE * base | IS_LAST * last
+    state = np.where(root, np.where(base, DRAWN, VISITED), 0).astype(np.uint8)
+    looked = surface.level[~direct]
+    level_end = np.searchsorted(surface.level, np.unique(looked), side="right")
+    return flags, state, np.concatenate([[0], level_end])
 
 
 def below_of(device: Device, surface: SurfelHierarchy) -> tuple:
@@ -116,24 +131,6 @@ def below_of(device: Device, surface: SurfelHierarchy) -> tuple:
     faces = np.where(finite[surface.triangles].all(axis=1)[:, None], surface.triangles, 0)  # one vertex: not drawn
     triangles = Triangles(fours(surface.vertices), device.upload(faces[:1]), fours(surface.vertex_normals), light)
     return surface.triangle_offset, faces, triangles
-
-
-def covered_maps(surface: SurfelHierarchy) -> NDArray:
-    """Return whether every texel that a surfel's disc touches is covered, (n,) bool."""
-    out = np.zeros(len(surface), bool)
-    covered = surface.normal_atlas[:, 3] > 0
-    for size in np.unique(surface.map_size):
-        edge = 2 * np.arange(size + 1) / size - 1
-        least = np.where(edge[:-1] * edge[1:] <= 0, 0, np.minimum(np.abs(edge[:-1]), np.abs(edge[1:])))
-        touched = np.flatnonzero((least[:, None]**2 + least**2 < 1).ravel())
-        own = np.flatnonzero(surface.map_size == size)
-        first, runs = surface.map_offset[own], np.diff(surface.map_offset[own])
-        if len(own) and (runs == size * size).all():  # maps stand together: a view of rows
-            rows = covered[first[0]:first[0] + len(own) * size * size].reshape(len(own), -1)
-            out[own] = rows.all(axis=1) if len(touched) == size * size else rows[:, touched].all(axis=1)
-        else:
-            out[own] = covered[first[:, None] + touched].all(axis=1)
-    return out
 
 
 def place_surfels(upload: SurfelUpload, matrix: NDArray | None, camera, size, lod: float) -> NDArray:
@@ -182,7 +179,7 @@ def tile_surfels(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpl
     """
     constants = grid.layout.constants | {
         "VW": scratch.lanes, "TILE_BINS": grid.tile_bins, "IS_PERSPECTIVE": perspective, "MAPS": maps,
-        "COLOR_MAPS": color_maps and grid.layout.color}
+        "COLOR_MAPS": color_maps and grid.layout.color, "ONE_COLOR": colors is not None and len(colors) == 1}
     group = 64 if scratch.lanes == 1 else 1
     device.kernel("render/tile_surfels.cl", constants=constants)(
         (grid.tile_count * group,), (group,), view, pairs.pairs, pairs.offsets, records, upload.atlas,
@@ -191,7 +188,10 @@ def tile_surfels(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpl
 
 
 def surfel_colors(device: Device, upload: SurfelUpload, shading: Shading) -> tuple[DeviceArray, bool]:
-    """Return the linear colours (count, 4) float32 that a surface is drawn with, and whether its colour maps count."""
+    """Return the linear colours that a surface is drawn with, and whether its colour maps count.
+
+    The colours are (count, 4) float32, or (1, 4): one for all.
+    """
     if shading.look == "ball_size":
         radius = np.log(np.maximum(upload.radii, 1e-30))
         low, high = (float(v) for v in (radius.min(), radius.max()))
@@ -202,8 +202,8 @@ def surfel_colors(device: Device, upload: SurfelUpload, shading: Shading) -> tup
     elif shading.model_colors and upload.colors is not None:
         return upload.colors, upload.color_atlas is not None
     else:
-        srgb = np.asarray(shading.color, np.float64)
-    out = np.ones((upload.count, 4), np.float32)
+        srgb = np.asarray(shading.color, np.float64)[None]
+    out = np.ones((len(srgb), 4), np.float32)
     out[:, :3] = to_linear(srgb)
     return device.upload(out), False
 
@@ -231,7 +231,7 @@ def draw_surfels(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpl
         return
     colors, color_maps = surfel_colors(device, upload, look.shading) if grid.layout.color else (None, False)
     # Depths of blended discs differ by a slab over the least cosine; lists are in order up to a bucket.
-    slack = float(1.05 / LEAN * floats[9] * upload.slabs[drawn].max() + floats[23])
+    slack = float(1.05 / LEAN * floats[9] * upload.slabs.take(drawn).max() + floats[23])
     perspective = camera.projection(grid.size).perspective
     maps = drawing.maps and not look.shading.look.startswith("ball")
     tile_surfels(device, scratch, grid, upload, view, records, pairs, colors, color_maps, maps, bool(perspective),

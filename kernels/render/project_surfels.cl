@@ -9,9 +9,6 @@
 #define BACK 0.25f  // radii that discs seen from behind are set back by: just past a silhouette they reach in front of it
 
 #define LEAN 0.25f  // cosine of ray and plane that the depths of blended discs are held to
-#define RIM_SPREAD 2.5f  // cones so many times as wide hold nearly all normals (1.75: 839 pixels at the dragon's outline
-                         // differ from the finest level's, 2.5: 455),
-#define RIM_LEAST 0.1f  // with the code's rounding and more
 
 __kernel void project_surfels(__global const float *view, __global const float *surfels, __global const int *list,
                               int count, __global float *records, __global short4 *full, __global uint *keys,
@@ -19,6 +16,15 @@ __kernel void project_surfels(__global const float *view, __global const float *
   int first = get_global_id(0) * VW;
   if (first >= count) return;
   int lanes = count - first < VW ? count - first : VW;
+#ifdef HAS_PREFETCH
+  // What the next work-item reads, and what this one writes. Dragon 1024x1024, PoCL on AVX2: 2.4 to 2.1 ms.
+  for (int i = 0; i < VW; i++) {
+    int next = first + VW + i < count ? first + VW + i : count - 1;
+    __builtin_prefetch((const void *)(size_t)(surfels + (size_t)list[next] * SURFEL_FLOATS));
+    __builtin_prefetch((const void *)(size_t)(records + (size_t)(first + i) * RECORD_FLOATS), 1);
+    __builtin_prefetch((const void *)(size_t)(records + (size_t)(first + i) * RECORD_FLOATS + LINE), 1);
+  }
+#endif
   VF field[SURFEL_FLOATS];
   for (int i = 0; i < VW; i++) {
     int at = list[first + (i < lanes ? i : lanes - 1)];
@@ -77,10 +83,10 @@ __kernel void project_surfels(__global const float *view, __global const float *
   VI front = perspective ? plane_by_ray < 0.0f : along < 0.0f;
   out[FACE] = SEL((VF)(-1.0f), (VF)(1.0f), front);
   VI flags = AS_VI(field[S_FLAGS]);
-  // Far enough from silhouettes all normals of the map face the eye's side.
-  VF spread = RIM_SPREAD * field[S_SPREAD] + RIM_LEAST;
-  if (perspective) spread += r * inv_depth;
-  VI plain = ((flags & IS_BASE) != 0) | (((flags & IS_COVERED) != 0) & (lean * lean > spread * spread * length2));
+  // Far enough from silhouettes no texel is trimmed (tile_surfels.cl); rays differ by the disc's width.
+  VF steep = field[S_PLAIN];
+  if (perspective) steep += r * inv_depth;
+  VI plain = ((flags & IS_BASE) != 0) | (lean * lean > steep * steep * length2);
   out[FLAGS] = AS_VF(flags | SEL((VI)(0), (VI)(IS_PLAIN), plain));
   out[CORE2] = SEL((VF)(1.0f), (VF)(CORE * CORE), (flags & IS_BASE) != 0);
 
@@ -114,7 +120,7 @@ __kernel void project_surfels(__global const float *view, __global const float *
     keys[at] = (uint)LANE(ordered) & 0xffffff00u;
     buckets[at] = (ushort)LANE(bucket_number);
     __global float *record = records + (size_t)at * RECORD_FLOATS;
-    for (int f = 0; f <= CORE2; f++) record[f] = lane[f * VW + i];
+    for (int f = 0; f < ID; f++) record[f] = lane[f * VW + i];
     record[ID] = as_float(list[at]);
   }
 }

@@ -1,5 +1,6 @@
 // Level of detail, one level of a surfel hierarchy: of the visited surfels, draw those that are small enough in the
-// picture, or of the finest level, and visit the children of the others. Launched level by level, coarse to fine; one
+// picture, or of the finest level, and visit the children of the others; children of which none has children itself are
+// drawn at once, so that most of the surfels need no look of their own. Launched level by level, coarse to fine; one
 // work-item handles VW surfels. Twin: tests/reference/surfels.py, select_surfels.
 //
 // Inside, a surfel may be INTERIOR pixels wide; where the normals below it, as far as its cone tells, may turn from the
@@ -57,12 +58,14 @@ __kernel void select_surfels(__global const float *view, __global const float *s
   const int *is_small = (const int *)&small, *is_out = (const int *)&out;
   for (int i = from; i < to; i++) {
     int at = first + i;
-    if (!state[at]) continue;
-    if (is_out[i]) { state[at] = UNSEEN; continue; }
+    if (state[at] != VISITED) continue;
     __global const int *s = (__global const int *)(surfels + (size_t)at * SURFEL_FLOATS);
     int flags = s[S_FLAGS];
-    if ((flags & IS_BASE) || (is_small[i] && view[LOD] > 0.0f)) { state[at] = DRAWN; continue; }
+    if (flags & IS_BASE) { state[at] = DRAWN; continue; }
+    if (is_out[i]) { state[at] = UNSEEN; continue; }
+    if (is_small[i] && view[LOD] > 0.0f) { state[at] = DRAWN; continue; }
     state[at] = flags & HAS_TRIANGLES ? BY_TRIANGLES : VISITED;
-    for (int c = s[S_CHILD]; c < s[S_CHILD] + s[S_CHILDREN]; c++) state[c] = VISITED;
+    uchar below = flags & IS_LAST ? DRAWN : VISITED;
+    for (int c = s[S_CHILD]; c < s[S_CHILD] + s[S_CHILDREN]; c++) state[c] = below;
   }
 }

@@ -1,5 +1,6 @@
 // Single rays against the base surfels of a hierarchy: what the tile renderer sees of the finest level. First the
-// frontmost inner disc, then a blend of the discs about as deep that are seen from the same side, in depth and normal.
+// frontmost inner disc (where that is seen from behind, the rest of a disc before it that is seen from its front), then
+// a blend of the discs about as deep that are seen from the same side, in depth and normal.
 // One work-item traces `batch` rays one after the other. Twin: tests/reference/surfels.py, ray_surfels.
 //
 // A bottom node has a block of 7 vectors of 16 floats: position, normal and radius of the surfel in each slot.
@@ -14,8 +15,9 @@ enum { D_X, D_Y, D_Z, D_NX, D_NY, D_NZ, D_RADIUS, FIELDS };
 #define LEAN 0.25f
 
 typedef struct { float low, hit, face; int blending; } Goal;
-// `key` orders the hits: those from behind are set back. The sums are of the blend, `last` its deepest disc.
-typedef struct { float key; int slot; float t, face, weight, depth, x, y, z, last; } Found;
+// `key` orders the hits: those from behind are set back. `whole` is the frontmost disc seen from its front, rest and all.
+// The sums are of the blend, `last` its deepest disc.
+typedef struct { float key; int slot; float t, face, whole; int whole_slot; float weight, depth, x, y, z, last; } Found;
 typedef __global const float *Model;
 
 INLINE VF magnitude(VF x) { return VMAX(x, -x); }
@@ -44,7 +46,15 @@ INLINE void leaf_hit(const Ray *r, const Goal *goal, Model blocks, int bottom, F
       found->last = last > found->last ? last : found->last;
       continue;
     }
-    VI in = (away2 < CORE * CORE * radius * radius) & (t > goal->low) & (t <= r->far);
+    VI all = (away2 < radius * radius) & (t > goal->low) & (t <= r->far);
+    if (!any_lane(all)) continue;
+    VF before = SEL((VF)(INFINITY), t, all & front);
+    float first = lane_min(before);
+    if (first < found->whole) {
+      found->whole = first;
+      found->whole_slot = bottom * WIDE + part + FIRST_BIT(bits_of(before == first));
+    }
+    VI in = all & (away2 < CORE * CORE * radius * radius);
     if (!any_lane(in)) continue;
     VF key = SEL((VF)(INFINITY), SEL(t + BACK * radius, t, front), in);
     float least = lane_min(key);
@@ -69,10 +79,13 @@ __kernel void ray_surfels(int count, int batch, int roots, int first_bottom, flo
     goal.low = r.low; goal.hit = goal.face = 0.0f; goal.blending = 0;
     if (MODE == NEXT && out[HIT_LOW] > goal.low) goal.low = out[HIT_LOW];
     Found found;
-    found.key = INFINITY; found.slot = -1;
+    found.key = found.whole = INFINITY; found.slot = found.whole_slot = -1;
     found.t = found.face = found.weight = found.depth = found.x = found.y = found.z = 0.0f;
     walk_one(&r, &goal, blocks, roots, first_bottom, boxes, &found);
     if (found.slot < 0) { out[HIT_T] = INFINITY; out[HIT_PRIMITIVE] = as_float(-1); continue; }
+    if (found.face < 0.0f && found.whole < found.t) {
+      found.slot = found.whole_slot; found.t = found.whole; found.face = 1.0f;
+    }
     int slot = found.slot;
     float t = found.t;
     found.last = t;

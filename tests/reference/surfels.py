@@ -7,7 +7,7 @@ from clsurf.surface.surfel import decoded_normals
 
 FALL, FACING = 4.0, 1e-3  # kernels/build/normal_maps.cl
 SLAB, LEAN, EDGE, BACK, CORE = 0.3, 0.25, 0.02, 0.25, 0.85  # clsurf/render/surfels.py, kernels/render/*surfels.cl
-RIM_SPREAD, RIM_LEAST, RIM_COSINE, RELIEF, RIM, TRIM = 2.5, 0.1, 0.4, 0.75, 0.35, 0.5
+RIM_COSINE, RELIEF, RIM, TRIM = 0.4, 0.75, 0.35, 0.5
 
 
 def surfel_radii(positions, normals, neighbours, overlap):
@@ -135,10 +135,10 @@ def select_surfels(surface, view, lod, interior):
     for i in range(n):
         if not state[i]:
             continue
-        if out[i]:
-            state[i] = 0
-        elif base[i] or (small[i] and lod > 0):
+        if base[i] or (not out[i] and small[i] and lod > 0):
             state[i] = 2
+        elif out[i]:
+            state[i] = 0
         else:
             for c in range(surface.child_offset[i], surface.child_offset[i + 1]):
                 state[surface.children[c]] = 1
@@ -169,35 +169,41 @@ def tile_surfels(surface, view, drawn, maps=True):
         if ahead and abs(cosine) < EDGE * np.linalg.norm(ray):
             continue
         inside = (a**2 + b**2 < 1) & (t > 0 if view.p.perspective else True)
-        normal = np.broadcast_to(surface.normals[s].astype(np.float64), (len(t), 3))
+        normal, rest = np.broadcast_to(surface.normals[s].astype(np.float64), (len(t), 3)), inside
         seen = inside & (a**2 + b**2 < CORE**2) if base[s] else inside
         if maps and not base[s]:
             w = int(surface.map_size[s])
             x, y = (np.clip(np.nan_to_num((c + 1) * w / 2), 0, w - 0.5).astype(int) for c in (a, b))
             texel = surface.normal_atlas[surface.map_offset[s] + y * w + x]
             normal = texel[:, :3] / 127.5 - 1
-            inside, seen = inside & (texel[:, 3] > 0), seen & (texel[:, 3] > 0)
-            spread = RIM_SPREAD * surface.spreads[s] + RIM_LEAST + (r / -p[2] if view.p.perspective else 0)
-            atlas = surface.normal_atlas[surface.map_offset[s]:surface.map_offset[s] + w * w, 3].reshape(w, w)
-            plain = covered(atlas) and cosine**2 > spread**2 * (ray @ ray)
-            if not plain:
-                past = (normal - TRIM * surface.normals[s]) @ view.rotation.T
-                seen = seen & (face * (past * view.rays).sum(axis=1) < 0)
+            toward = -((normal @ view.rotation.T) * view.rays).sum(axis=1)
+            past = ((normal - TRIM * surface.normals[s]) @ view.rotation.T * view.rays).sum(axis=1)
+            steep = plain_cosine(surface, s) + (r / -p[2] if view.p.perspective else 0)
+            rest = inside & (texel[:, 3] > 0)
+            if cosine**2 <= steep**2 * (ray @ ray):
+                seen = seen & (texel[:, 3] > 0) & (face * past < 0)
+                rest = rest & (toward > 0)
+            inside = inside & (texel[:, 3] > 0)
         deep = max(abs(n @ p), -LEAN * p[2]) if view.p.perspective else max(abs(cosine), LEAN)
         slab = (SLAB * r + float(surface.heights[s])) / deep
-        rows.append((t, a**2 + b**2, inside, seen, face, r * BACK, slab, normal, s))
+        rows.append((t, a**2 + b**2, inside, seen, rest & (face > 0), face, r * BACK, slab, normal, s))
     pixels = len(view.rays)
     best, hit, side = np.full(pixels, np.inf), np.full(pixels, np.nan), np.zeros(pixels)
-    nearest = np.full(pixels, -1)
-    for t, _, _, seen, face, bias, _, _, s in rows:
+    nearest, front, front_nearest = np.full(pixels, -1), np.full(pixels, np.inf), np.full(pixels, -1)
+    for t, _, _, seen, rest, face, bias, _, _, s in rows:
         with np.errstate(all="ignore"):
             key = t if face > 0 else (1 / (1 / t - bias / t**2) if view.p.perspective else t + bias)
             key = np.where(key <= 0, np.inf, key) if view.p.perspective else key
             better = seen & (t > view.near) & (key < best)
         best, hit, side = np.where(better, key, best), np.where(better, t, hit), np.where(better, face, side)
         nearest = np.where(better, s, nearest)
+        better = rest & (t > view.near) & (t < front)
+        front, front_nearest = np.where(better, t, front), np.where(better, s, front_nearest)
+    # Through a gap: discs seen from behind give way to what else lies before them.
+    through = (side < 0) & (front < hit)
+    hit, side, nearest = (np.where(through, *pair) for pair in ((front, hit), (1, side), (front_nearest, nearest)))
     weight, depth, normal, count = np.zeros(pixels), np.zeros(pixels), np.zeros((pixels, 3)), np.zeros(pixels, int)
-    for t, t2, inside, _, face, _, slab, n, _ in rows:
+    for t, t2, inside, _, _, face, _, slab, n, _ in rows:
         with np.errstate(all="ignore"):
             apart = np.abs(hit / t - 1) if view.p.perspective else np.abs(hit - t)
             use = inside & (apart < slab) & (face == side)
@@ -219,12 +225,18 @@ def tile_surfels(surface, view, drawn, maps=True):
         return depth / weight, n @ view.rotation, count, nearest
 
 
-def covered(atlas):
-    """Whether all texels (w, w) that the disc touches are covered."""
-    w = len(atlas)
+def plain_cosine(surface, s):
+    """Cosine between disc and ray from which every texel of surfel s is seen; 2 where some may always be hidden."""
+    w = int(surface.map_size[s])
     edge = 2 * np.arange(w + 1) / w - 1
     least = np.where(edge[:-1] * edge[1:] <= 0, 0, np.minimum(np.abs(edge[:-1]), np.abs(edge[1:])))
-    return bool((atlas[least[:, None] ** 2 + least**2 < 1] > 0).all())
+    texels = surface.normal_atlas[surface.map_offset[s]:surface.map_offset[s] + w * w]
+    texels = texels[(least[:, None] ** 2 + least**2 < 1).ravel()]
+    a = np.arccos(np.clip((decoded_normals(texels) @ surface.normals[s].astype(np.float64)).min(), -1, 1))
+    if (texels[:, 3] == 0).any() or np.cos(a) <= TRIM:
+        return 2.0
+    # cos(t + a) = TRIM cos t at tan t = (cos a - TRIM) / sin a
+    return np.cos(np.arctan2(np.cos(a) - TRIM, np.sin(a)))
 
 
 def angles(codes, normals):
@@ -249,6 +261,9 @@ def ray_surfels(surface, origins, directions):
         k = np.argmin(key)
         if not np.isfinite(key[k]):
             continue
+        front = np.where((away2 < r**2) & (t > 0) & (face > 0), t, np.inf)
+        if face[k] < 0 and front.min() < t[k]:
+            k = np.argmin(front)
         use = (away2 < r**2) & (np.abs(t - t[k]) * np.maximum(np.abs(along), LEAN) < SLAB * r) & (face == face[k])
         g = np.where(use, (1 - away2 / r**2) ** 3, 0)
         distance[i], number[i] = (g[use] @ t[use]) / g.sum(), base[k]
