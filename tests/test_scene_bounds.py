@@ -21,7 +21,7 @@ CAMERAS = (clsurf.Camera.look_at((2.5, 1.1, 1.7), (0, 0, 0), fov=42),
 # No node drawn as a pixel, which puts it up to half a pixel aside.
 EXACT = PatchDrawing(direct=False, mip=False)
 FINE = 320  # facets around the scale map's mesh, the one scan that is not on the sphere itself
-TIE = 2e-5  # discs that begin behind another surface are not blended with those that begin before it
+TIE = 2e-6  # rounding
 SAG = 1 - np.cos(np.pi / FINE) ** 2
 
 
