@@ -8,75 +8,20 @@ of its own, which is how the job `devices` and the memory checks under Oclgrind 
 import argparse
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 import clsurf
+from clsurf.build.point_tree import build_point_tree
+from clsurf.build.stream_cells import covered_by, records_of
 from clsurf.surface.mesh import Mesh
-from clsurf.surface.ranges import RangeImage, RangeScan
+from clsurf.view.picture import to_bytes
+
+from .answer_scenes import SIZES as SIZES
+from .answer_scenes import Size, camera, forms, in_levels, scans
+from .answer_scenes import surfaces as surfaces
 
 KINDS = ("contours", "suggestive_contours", "ridges", "valleys", "parabolic")
-
-
-@dataclass(frozen=True)
-class Size:
-    """How large the scenes are: "tiny" for checkers that take a thousand times longer, "small" for comparisons."""
-
-    points: int
-    picture: tuple[int, int]
-    rays: int
-    lit: tuple[int, int] = (480, 360)  # pictures with traced light, whose pixels cost ten times as much
-
-
-SIZES = {"tiny": Size(300, (40, 32), 40, (20, 16)), "small": Size(20_000, (480, 360), 20_000)}
-
-
-def scans(size: Size) -> dict:
-    """Return the scans that the jobs read: a torus as cloud and mesh, a wavy range image."""
-    cloud = clsurf.models.torus(size.points)
-    ring = max(8, int(np.sqrt(2 * size.points)))
-    mesh = torus_mesh(ring, max(6, ring // 2))
-    return {"cloud": cloud, "mesh": mesh, "ranges": wavy_ranges(max(12, int(np.sqrt(size.points))))}
-
-
-def torus_mesh(around: int, across: int) -> Mesh:
-    """Return a closed, coloured mesh of the torus with radii 1 and 0.4."""
-    t, s = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(across) * 2 * np.pi / across, indexing="ij")
-    ring = 1 + 0.4 * np.cos(s)
-    points = np.stack([ring * np.cos(t), ring * np.sin(t), 0.4 * np.sin(s)], axis=-1).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
-    here, on = i * across + j, (i + 1) % around * across + j
-    up, both = i * across + (j + 1) % across, (i + 1) % around * across + (j + 1) % across
-    faces = np.stack([here, on, both, here, both, up], axis=-1).reshape(-1, 3)
-    colors = np.full((len(points), 4), 255, np.uint8)
-    colors[:, :3] = 40 + 180 * (points - points.min(axis=0)) / np.ptp(points, axis=0)
-    return Mesh(points, faces, colors=colors)
-
-
-def wavy_ranges(n: int) -> RangeScan:
-    """Return one coloured depth image of a wavy sheet with a step in it."""
-    y, x = np.mgrid[:n, :n]
-    depth = (2 + 0.1 * np.sin(6 * x / n) * np.cos(4 * y / n) + 0.4 * (x > n // 2)).astype(np.float32)
-    depth[:2, :3] = np.nan
-    color = np.zeros((n, n, 4), np.uint8)
-    color[..., 0], color[..., 1], color[..., 3] = 255 * x // n, 255 * y // n, 255
-    intrinsics = np.array([[n, 0, n / 2], [0, n, n / 2], [0, 0, 1.0]])
-    return RangeScan([RangeImage(depth=depth, intrinsics=intrinsics, color=color, pose=np.eye(4))])
-
-
-def surfaces(device, size: Size) -> dict:
-    """Return the surfaces that the jobs draw and measure, made on `device`."""
-    given = scans(size)
-    made = {f"slim{degree}": clsurf.build_slim(given["mesh"], degree=degree, error=0.02, device=device)
-            for degree in (1, 2, 3)}
-    made["patches"] = clsurf.build_patches(given["mesh"], patches=max(12, size.points // 200), nodes=9, device=device)
-    made["surfels"] = clsurf.build_surfels(given["mesh"], map_size=4, device=device)
-    made["hybrid"] = clsurf.build_surfels(given["mesh"], map_size=4, hybrid=True, device=device)
-    made["scale_map"] = clsurf.build_scale_map(given["mesh"], size=16, normals=True, device=device)
-    return made
-
-
 JOBS: dict[str, Callable] = {}
 
 
@@ -84,11 +29,6 @@ def job(function):
     """Enter ``function(device, size, surfaces) -> arrays by name`` as the job of its name."""
     JOBS[function.__name__] = function
     return function
-
-
-def camera(size: Size):
-    """Return the camera of every picture: the torus from above, with some of its inside."""
-    return clsurf.Camera.look_at((1.3, -2.2, 2.4), (0, 0, 0), up=(0, 0, 1), fov=40)
 
 
 def channels_of(frame) -> dict:
@@ -135,7 +75,7 @@ def draw_slim(device, size, made):
     out, plain = {}, ("color", "depth", "normal", "position", "id", "count", "level", "cost")
     second = ("mean", "gaussian", "k1", "k2", "direction1", "direction2", "radial")
     third = ("derivative1", "derivative2", "radial_derivative")
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             for degree in (1, 2, 3):
                 extra = () if degree == 1 else second if degree == 2 else (*second, *third)
@@ -161,7 +101,7 @@ def draw_patches(device, size, made):
              "gouraud": {"shading": "gouraud"}, "table": {"normal_table": True}, "ordered": {"normal_table": "ordered"},
              "alpha": {"alpha": True}, "culled": {"cull": True}, "smooth_normals": {"normals": "smooth"}}
     out = {}
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             for name, options in modes.items():
                 frame = renderer.render(made["patches"], camera(size), size.picture,
@@ -199,7 +139,7 @@ def draw_others(device, size, made):
     things = {name: made[name] for name in ("surfels", "hybrid", "scale_map")}
     things |= {"mesh": given["mesh"], "cloud": given["cloud"], "bare": clsurf.PointCloud(given["cloud"].points)}
     channels = ("color", "depth", "normal", "position", "id", "count", "level", "cost")
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             for name, thing in things.items():
                 frame = renderer.render(thing, camera(size), size.picture, channels)
@@ -223,7 +163,7 @@ def materials(device, size, made):
     names, out = ("slim2", "patches", "surfels", "scale_map"), {}
     scene = clsurf.Scene([made[name].moved(raised(0.6 * i)) for i, name in enumerate(names)], lights=lamps,
                          materials=looks)
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.lit, ("color",), background="sky",
                                                     shading=clsurf.Shading(occlusion=32)).color
@@ -237,7 +177,7 @@ def light(device, size, made):
     shading = clsurf.Shading(shadows=True, occlusion=32, mirror=0.3)
     scene = clsurf.Scene([made["slim2"], made["patches"].moved(raised(0.7))], lights=lamps)
     out = {}
-    for lanes in (16, 1):
+    for lanes in forms(device):
         with clsurf.Renderer(device, lanes=lanes) as renderer:
             out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.lit, ("color",),
                                                     shading=shading).color
@@ -308,6 +248,66 @@ def lines(device, size, made):
                           device=device)
     found = clsurf.lines(frame, KINDS, device=device)
     return {"points": found.points, "drawn": found.draw(frame).color}
+
+
+@job
+def search_levels(device, size, made):
+    """Pictures for which the hierarchy is searched: of three levels, from where their surfels are small."""
+    out, thing = {}, in_levels(made["slim2"])
+    far = clsurf.Camera.look_at((0, -40, 20), (0, 0, 0))
+    for lanes in forms(device):
+        with clsurf.Renderer(device, lanes=lanes) as renderer:
+            for lod in (3, 30):
+                out[f"level_{lod}_{lanes}"] = renderer.render(thing, far, (24, 24), ("level",), lod=lod).level
+    return out
+
+
+@job
+def trace_grid(device, size, made):
+    """The rays of a picture, which go to packets where there are enough of them."""
+    origins, directions = camera(size).rays((80, 56))
+    hits = clsurf.trace(made["slim2"], origins, directions, device=device)
+    return {"hit_distance": hits.distance, "primitive": hits.primitive, "normal": hits.normal}
+
+
+@job
+def stream(device, size, made):
+    """What streamed builds ask of a cell's points: how leaves made before fit and cover them."""
+    cloud, surface = scans(size)["cloud"], made["slim2"]
+    place, record = records_of(surface, np.flatnonzero(surface.leaf), cloud.origin)
+    tree = build_point_tree(cloud.points, cloud.normals, np.zeros(3, np.float32), 1 / surface.diagonal, device)
+    sums, own = device.empty((len(place), 2), np.float32), device.upload(np.ones(tree.padded, np.uint8))
+    device.kernel("build/check_leaves.cl")((len(place),), (1,), len(place), device.upload(place),
+                                           device.upload(record), 6, tree.padded, tree.sorted, own,
+                                           *tree.arguments[2:], sums)
+    covered = covered_by(tree, place, record, np.inf, surface.degree)
+    return {"sums": device.download(sums), "covered": device.download(covered)}
+
+
+@job
+def helpers(device, size, made):
+    """The kernels that test a device and the helpers of others, and the viewer's bytes."""
+    rng, out = np.random.default_rng(0), {}
+    numbers, normal = rng.normal(size=(2, 64)).astype(np.float32), rng.normal(size=(64, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    given = (rng.normal(0, 0.3, (64, 32)), rng.uniform(-0.5, 0.5, (64, 3)), normal, np.ones(64))
+    for lanes in forms(device):
+        a, b = (device.upload(row) for row in numbers)
+        made_of = [device.empty(64, np.float32) for _ in range(4)] + [device.empty((64 // lanes, 2), np.int32)]
+        device.kernel("common/probe_lanes.cl", constants={"VW": lanes})((64 // lanes,), (1,), a, b, *made_of)
+        out |= {f"lanes_{i}_{lanes}": device.download(array) for i, array in enumerate(made_of[:4])}
+        target = device.empty(64, np.float32)
+        device.kernel("common/self_test.cl", constants={"VW": lanes})((64 // lanes,), (1,), a, target, 2.0)
+        out[f"self_test_{lanes}"] = device.download(target)
+        root = device.empty((64, 7), np.float32)
+        device.kernel("common/probe_slim.cl", constants={"VW": lanes, "DEGREE": 3})(
+            (64,), None, *(device.upload(array, np.float32) for array in given), 64, root)
+        out[f"root_{lanes}"] = device.download(root)
+    frame = device.empty((64, 6), np.float32)
+    device.kernel("common/probe_frame.cl")((64,), None, device.upload(normal), frame)
+    out["frame"] = device.download(frame)
+    out["bytes"] = to_bytes(device, rng.uniform(-0.5, 1.5, (9, 13, 4)).astype(np.float32))
+    return out
 
 
 def digest(array) -> str:

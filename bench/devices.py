@@ -22,7 +22,7 @@ from .table import print_table
 
 DIAGONAL = float(np.linalg.norm([2.8, 2.8, 0.8]))  # of the torus that all pictures show
 DEPTH_TOLERANCE, DEPTH_SHARE, NUMBER_SHARE = 1e-5, 0.9999, 0.999
-PICTURES = ("draw_slim", "draw_patches", "draw_others", "trace")
+PICTURES = ("draw_slim", "draw_patches", "draw_others", "search_levels", "trace", "trace_grid")
 # Their jobs compare what is built, measured or lit; the pictures decide over one answer everywhere.
 JOB_SECONDS = 3000
 RUN = ("import sys; from clsurf.cli.machine import bench_package; bench_package(); from clsurf_bench import answers; "

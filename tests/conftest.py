@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from bench.answer_scenes import forms
 from clsurf.device import open_device
 from clsurf.render.renderer import Renderer
 
@@ -24,10 +25,30 @@ def device():
     return open_device(os.environ.get("CLSURF_DEVICE") or "pocl")
 
 
+def pytest_collection_modifyitems(config, items):
+    """On a device of single items, kernels of several lanes are left out: nobody gets them there (clsurf/device)."""
+    if not any(hasattr(item, "callspec") and "lanes" in item.callspec.params for item in items):
+        return
+    most = max(forms(open_device(os.environ.get("CLSURF_DEVICE") or "pocl")))
+    left_out = [item for item in items if hasattr(item, "callspec") and item.callspec.params.get("lanes") in (4, 8, 16)
+                and item.callspec.params["lanes"] > most]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.fixture(params=[16, 8, 4, 1])
+def lanes(request, device, monkeypatch):
+    """Both kernel forms, and narrower vectors."""
+    monkeypatch.setattr(device, "lanes", request.param)
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def renderers(device):
     """Renderers in both kernel forms, and one of small tiles."""
-    with Renderer(device, lanes=16) as lanes, Renderer(device, lanes=1) as items, Renderer(device, tile=8) as small:
+    first = forms(device)[0]
+    with Renderer(device, lanes=first) as lanes, Renderer(device, lanes=1) as items, Renderer(device, tile=8) as small:
         yield lanes, items, small
 
 

@@ -41,7 +41,9 @@ def test_local_spacings_are_those_of_an_even_grid(device):
     assert np.median(spacing) == pytest.approx(0.02 / 4, rel=0.15)
 
 
-def test_sample_fits(device):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_sample_fits(device, lanes, monkeypatch):
+    monkeypatch.setattr(device, "lanes", lanes)
     points, normals = noisy_torus(0.003, 3000)
     tree = tree_of(points, normals, device)
     samples = risk.spread_samples(tree, 20)

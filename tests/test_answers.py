@@ -15,10 +15,6 @@ from clsurf.device import context
 from clsurf.device.program import Kernel
 from clsurf.device.sources import SIGNATURE, kernel_folder
 
-# Kernels of tests and of what a tiny scene has no use for: coarse levels, packets of large pictures, streamed builds,
-# whose own tests run them, and the viewer's.
-ELSEWHERE = {"probe_frame", "probe_lanes", "probe_slim", "self_test", "select_slim", "trace_pixels", "grid_hits",
-             "on_grid", "check_leaves", "cover_leaves", "pack_bytes"}
 SIZE = answers.SIZES["tiny"]
 
 
@@ -39,7 +35,7 @@ def test_the_jobs_run_every_kernel(device, made):
         device.profile = kept
     there = {match[1] for path in kernel_folder().rglob("*.cl")
              for match in SIGNATURE.finditer(re.sub(r"//[^\n]*", "", path.read_text()))}
-    assert there - ran == ELSEWHERE
+    assert there == ran
 
 
 def test_equal_bytes_every_time(device, made):

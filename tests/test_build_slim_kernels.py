@@ -128,23 +128,25 @@ def test_choose_centers(tree, sorted_points, spacing):
 LAMBDA = 1e-8
 
 
-def fitted(tree, degree, centers, r_r, penalty=1e-9, mode=slim.SEGMENT, tolerance=np.inf):
+def fitted(tree, degree, centers, r_r, lanes=None, penalty=1e-9, mode=slim.SEGMENT, tolerance=np.inf):
     device = tree.device
     need = 2 * twin.terms(min(degree, 2)) + 2
     out = device.empty((len(centers), slim.RECORD), np.float32)
-    kernel = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree})
+    form = {"VW": lanes} if lanes else point_tree.lane_form(device)
+    kernel = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree, **form})
     kernel((len(centers),), (1,), len(centers), device.upload(centers, np.int32), r_r, LAMBDA, penalty, 0.02, need,
            mode, tolerance, *tree.arguments, out)
     return device.download(out), need
 
 
 @pytest.mark.parametrize("degree", (1, 2, 3))
-def test_fit_surfels(tree, sorted_points, degree):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_fit_surfels(tree, sorted_points, degree, lanes):
     points, normals = sorted_points
     centers = np.arange(0, tree.count, 25)
     agree = 0
     for r_r in (0.06, 0.14):
-        record, need = fitted(tree, degree, centers, r_r)
+        record, need = fitted(tree, degree, centers, r_r, lanes)
         for c, got in zip(centers, record.astype(float), strict=True):
             if (((points - points[c]) ** 2).sum(axis=1) < r_r**2).sum() < need:
                 continue  # the kernel's ball grows, see test_sparse_ball
@@ -161,10 +163,11 @@ def test_fit_surfels(tree, sorted_points, degree):
     assert agree > 0.9 * 2 * len(centers) - 20
 
 
-def test_cubics_on_few_points_are_quadratics(tree, sorted_points):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_cubics_on_few_points_are_quadratics(tree, sorted_points, lanes):
     """A bent sheet: the smallest balls are quadratics, and no leaf of degree 3 has an E above that of degree 2."""
     centers = np.arange(0, tree.count, 10)
-    found = {degree: fitted(tree, degree, centers, 0.06, penalty=1e-12)[0] for degree in (2, 3)}
+    found = {degree: fitted(tree, degree, centers, 0.06, lanes, penalty=1e-12)[0] for degree in (2, 3)}
     few, cubic = (found[3][:, 12:] == 0).all(axis=1), found[3]
     points = np.array([((sorted_points[0] - sorted_points[0][c]) ** 2).sum(axis=1) for c in centers])
     count = (points < (cubic[:, 0] * (1 - 1e-5))[:, None] ** 2).sum(axis=1)
@@ -177,14 +180,15 @@ def test_cubics_on_few_points_are_quadratics(tree, sorted_points):
     assert np.mean(energy[3][both] <= energy[2][both] * (1 + 1e-4)) > 0.95
 
 
-def test_fit_leaves_sheet_behind_out(device):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_fit_leaves_sheet_behind_out(device, lanes):
     """Sparse points, two bent sheets nearer to each other than a ball is wide: every leaf is of its own sheet."""
     points, normals = wavy_sheet(700)
     points, normals = np.concatenate([points, points - 0.02 * normals]), np.concatenate([normals, -normals])
     tree = point_tree.build_point_tree(points, normals, np.zeros(3, np.float32), 1.0, device)
     host = device.download(tree.sorted)[:, :tree.count].astype(float)
     centers = np.arange(0, tree.count, 10)
-    record, need = fitted(tree, 2, centers, 0.09, penalty=1e-12)
+    record, need = fitted(tree, 2, centers, 0.09, lanes, penalty=1e-12)
     agree = 0
     for c, got in zip(centers, record.astype(float), strict=True):
         inside = ((host[:3].T - host[:3, c]) ** 2).sum(axis=1) < 0.09**2
@@ -200,12 +204,13 @@ def test_fit_leaves_sheet_behind_out(device):
     assert agree > 0.6 * len(centers)
 
 
-def test_fit_of_thinned_ball(device):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_fit_of_thinned_ball(device, lanes):
     points, normals = wavy_sheet(20000, noise=1e-3)
     tree = point_tree.build_point_tree(points, normals, np.zeros(3, np.float32), 1.0, device)
     host = device.download(tree.sorted)[:, :tree.count].astype(float)
     centers = np.arange(0, tree.count, 999)
-    record, _ = fitted(tree, 2, centers, 0.2, mode=slim.FIXED)
+    record, _ = fitted(tree, 2, centers, 0.2, lanes, mode=slim.FIXED)
     for c, got in zip(centers, record.astype(float), strict=True):
         _, k, e2 = twin.fit_at(host[:3].T, host[3:].T, c, 0.2, 0.618034 * 0.2, 2)
         assert got[4] == pytest.approx(np.sqrt(e2), rel=1e-3)
@@ -213,8 +218,9 @@ def test_fit_of_thinned_ball(device):
         np.testing.assert_allclose(got[6:12] * unit, k * unit, atol=2e-5)
 
 
-def test_sparse_ball(tree):
-    record, _ = fitted(tree, 2, np.arange(0, tree.count, 200), 1e-4)
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_sparse_ball(tree, lanes):
+    record, _ = fitted(tree, 2, np.arange(0, tree.count, 200), 1e-4, lanes)
     assert (record[:, 5] == 1).all() and (record[:, 0] > 1e-4).all() and np.isfinite(record[:, :12]).all()
 
 
@@ -265,11 +271,12 @@ def test_check_leaves(tree, sorted_points):
 
 
 @pytest.mark.parametrize("tolerance", (1e-3, 1e-4))
-def test_tolerance_of_fits(tree, sorted_points, tolerance):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_tolerance_of_fits(tree, sorted_points, tolerance, lanes):
     """A leaf keeps half the tolerance in its mean error and comes near its centre, or is a disc at the centre."""
     centers = np.arange(0, tree.count, 10)
-    record, _ = fitted(tree, 2, centers, 0.14, tolerance=tolerance)
-    free, _ = fitted(tree, 2, centers, 0.14)
+    record, _ = fitted(tree, 2, centers, 0.14, lanes, tolerance=tolerance)
+    free, _ = fitted(tree, 2, centers, 0.14, lanes)
     disc = (record[:, 6:] == 0).all(axis=1) & (record[:, 5] > 0)
     leaf = (record[:, 5] > 0) & ~disc
     assert (record[leaf, 4] <= 0.5 * tolerance * 1.01).all() and (np.abs(record[leaf, 6]) <= tolerance).all()

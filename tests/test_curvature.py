@@ -397,7 +397,9 @@ def test_spread_centers(device):
     assert between.min() > 0.0299
 
 
-def test_fit_quartics(device):
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_fit_quartics(device, lanes, monkeypatch):
+    monkeypatch.setattr(device, "lanes", lanes)
     tree, host = tree_of(2000, device, 0.002)
     radius = np.full(tree.padded // 16, 0.09, np.float32)
     surfels = quartics.fit_surfels(tree, radius)

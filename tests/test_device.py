@@ -107,6 +107,20 @@ def test_kernels_are_kept_per_thread(device):
     assert other[0] is not first
 
 
+@pytest.mark.parametrize("count", (29, 64, 5))
+def test_items_asked_for_one_by_one_run_in_groups(device, count, monkeypatch):
+    """Every one of them, and none that was not asked for."""
+    monkeypatch.setattr(device, "group_items", 8)
+    sizes, enqueue = [], cl.enqueue_nd_range_kernel
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", lambda *given: (sizes.append(given[3]), enqueue(*given)))
+    source, target = device.upload(np.arange(64, dtype=np.float32)), device.empty(64, np.float32)
+    device.fill(target, -1)
+    device.kernel("common/self_test.cl", constants={"VW": 1})((count,), (1,), source, target, 2.0)
+    got = device.download(target)
+    np.testing.assert_allclose(got[:count], 2 * np.sqrt(np.arange(count)) + 1, rtol=1e-6)
+    assert (got[count:] == -1).all() and ((8,) in sizes) == (count >= 8)
+
+
 @pytest.mark.parametrize("lanes", [16, 8, 4, 1])
 def test_lane_helpers(device, lanes):
     """Every macro of lanes.clh against NumPy, in every form."""

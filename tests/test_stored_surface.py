@@ -1,16 +1,21 @@
 """Surfaces that stay in their store under project, error, curvature and trace: what the whole surface gives."""
 
+import contextlib
 import functools
 import http.server
+import json
+import shutil
 import threading
+import tracemalloc
 
 import numpy as np
 import pytest
+import zarr
 from test_build_streamed import ORIGIN, ground, write_las
 
 import clsurf
 from clsurf.build import streamed
-from clsurf.errors import InputError
+from clsurf.errors import FileFormatError, InputError
 from clsurf.io.stored import StoredSurface
 from clsurf.io.stored_leaves import BYTES
 
@@ -139,15 +144,20 @@ def test_reads_what_lies_on_the_way_only(place, device, monkeypatch):
     assert not clsurf.trace(stored, down, (0, 0, 1.0), device=device).hit.any() and len(read) == before
 
 
-def test_over_the_web(place, whole, device):
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=place)
-    handler.log_message = lambda *_: None
+@contextlib.contextmanager
+def served(folder):
+    """The address of a folder on the web."""
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=folder)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        remote = clsurf.open_surface(f"http://127.0.0.1:{server.server_address[1]}")
-        points = points_near(200)
-        near, hits = clsurf.project(remote, points, device), clsurf.trace(remote, *rays(), device=device)
+        yield f"http://127.0.0.1:{server.server_address[1]}"
         server.shutdown()
+
+
+def test_over_the_web(place, whole, device):
+    with served(place) as address:
+        remote, points = clsurf.open_surface(address), points_near(200)
+        near, hits = clsurf.project(remote, points, device), clsurf.trace(remote, *rays(), device=device)
     np.testing.assert_allclose(near.distance, clsurf.project(whole, points, device).distance, atol=2e-4)
     assert (hits.hit == clsurf.trace(whole, *rays(), device=device).hit).mean() > 0.999
 
@@ -159,3 +169,60 @@ def test_a_plain_store(whole, device, tmp_path):
                                clsurf.project(whole, points, device).distance, atol=2e-4)
     with pytest.raises(InputError, match="budget"):
         clsurf.open_surface(tmp_path / "zip.clsurf", budget=0)
+
+
+ABSURD = 1 << 34  # rows; 200 GB and more
+
+
+def edited(place, tmp_path, array: str, **changes):
+    """A copy of a store in which `array` declares something else."""
+    copy = tmp_path / "damaged.clsurf"
+    shutil.copytree(place, copy)
+    about = copy / array / "zarr.json"
+    about.write_text(json.dumps(json.loads(about.read_text()) | changes))
+    return copy
+
+
+def refused(address, word):
+    """What opening or reading says, which takes no memory worth mentioning."""
+    tracemalloc.start()
+    with pytest.raises(FileFormatError, match=word) as caught:
+        opened = StoredSurface(address)
+        opened.read(0)
+        opened.read(1, 3)
+    assert tracemalloc.get_traced_memory()[1] < 50e6 and "\n" not in str(caught.value)
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("where", ("disk", "web"))
+@pytest.mark.parametrize(("array", "shape"), [
+    ("bounds", [ABSURD, 2, 3]), ("surfels", [ABSURD, 25]), ("parts/00000/origin", [ABSURD]),
+    ("parts/00001/centers", [ABSURD, 3]), ("parts/00001/radii", [ABSURD]), ("parts/00001/children", [ABSURD]),
+    ("parts/00001/coefficients", [100, ABSURD]), ("parts/00001/child_offset", [ABSURD])])
+def test_absurd_shapes_are_refused_before_memory_is_taken(place, tmp_path, array, shape, where):
+    copy = edited(place, tmp_path, array, shape=shape)
+    with served(copy) if where == "web" else contextlib.nullcontext(copy) as address:
+        refused(address, "damaged")
+
+
+def test_counts_and_chunks_that_do_not_fit_are_refused(place, tmp_path):
+    """An index that agrees with an absurd part, chunks that are missing, and one chunk of everything."""
+    copy = edited(place, tmp_path, "parts/00001/radii", shape=[ABSURD])
+    index = zarr.open_group(copy, mode="r+")
+    surfels = index["surfels"][...]
+    surfels[1] = 0
+    surfels[1, 0] = ABSURD
+    index["surfels"][...] = surfels
+    refused(copy, "expected the shape")
+    with served(copy) as address:
+        refused(address, "damaged")
+    shutil.rmtree(copy)
+    shutil.copytree(place, copy)
+    (copy / "parts/00001/centers/c/0/0").unlink()
+    refused(copy, "chunks")
+    shutil.rmtree(copy)
+    grid = {"name": "regular", "configuration": {"chunk_shape": [ABSURD]}}
+    copy = edited(place, tmp_path, "parts/00001/radii", chunk_grid=grid)
+    refused(copy, "chunks")
+    with served(copy) as address:
+        refused(address, "chunks")

@@ -11,13 +11,6 @@ from clsurf import Camera, Scene
 from clsurf.surface.scale_map import ScaleMap
 
 
-@pytest.fixture(params=[16, 8, 4, 1])
-def lanes(request, device, monkeypatch):
-    """Both kernel forms, and narrower vectors."""
-    monkeypatch.setattr(device, "lanes", request.param)
-    return request.param
-
-
 def wavy(d):
     return 1 + 0.25 * np.sin(4 * d[..., 0] + 1) * np.cos(3 * d[..., 1] - d[..., 2])
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..io import images
 from ..io.files import replacing
+from ..render.checked import checked_size
 from ..render.frame import Frame
-from ..render.renderer import checked_size
 from ..surface.arrays import frozen
 from ..surface.srgb import to_linear
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..build.point_tree import BLOCK, PointTree, build_boxes
+from ..build.point_tree import BLOCK, PointTree, build_boxes, lane_form
 from ..device import Device
 from ..device.arrays import DeviceArray
 
@@ -68,7 +68,7 @@ def fit_surfels(tree: PointTree, block_radius: NDArray, noise: float = 0.0, spac
     padded = -(-count // BLOCK) * BLOCK
     growth = max(GROWTH, 2 / float(block_radius.min())) if tree.count < TINY else GROWTH
     records, balls = device.empty((padded, SURFEL), np.float32), device.empty((4, padded), np.float32)
-    device.kernel("analysis/fit_quartics.cl")(
+    device.kernel("analysis/fit_quartics.cl", constants=lane_form(device))(
         (padded,), (1,), count, padded, centers, device.upload(block_radius), growth, noisy * RIDGE[0],
         noisy * RIDGE[1], max(PLAIN[0] * noise, PLAIN[1]) * spacing, *tree.arguments, records, balls)
     radius = device.upload(device.download(balls)[3])

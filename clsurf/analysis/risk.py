@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from ..build.point_tree import BLOCK, PointTree
+from ..build.point_tree import BLOCK, PointTree, lane_form
 
 SAMPLES = (1000, 8000)  # least and most, where there are so many points
 POINTS_PER_SAMPLE = 48
@@ -115,7 +115,7 @@ def fit_samples(tree: PointTree, samples: Samples, radius: NDArray, residual: bo
     device = tree.device
     skips = np.zeros(radius.shape[1], np.int32) if skips is None else np.asarray(skips, np.int32)
     out = device.empty((*radius.shape, OUT), np.float32)
-    device.kernel("analysis/sample_fits.cl", constants={"RESIDUAL": int(residual)})(
+    device.kernel("analysis/sample_fits.cl", constants={"RESIDUAL": int(residual), **lane_form(device)})(
         (radius.size,), (1,), len(radius), radius.shape[1], device.upload(samples.index),
         device.upload(np.ascontiguousarray(radius, np.float32)), device.upload(skips), *tree.arguments, out)
     return device.download(out).astype(np.float64)

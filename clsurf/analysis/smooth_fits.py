@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..build.point_tree import BLOCK, build_boxes
+from ..build.point_tree import BLOCK, build_boxes, lane_form
 from ..device import Device
 from ..device.arrays import DeviceArray
 
@@ -122,11 +122,6 @@ class Queries:
 def lanes_size(device: Device) -> tuple[int]:
     """Return a work-group size for kernels of VW lanes: those with large private arrays need 1 on CPUs."""
     return (64,) if device.lanes == 1 and device.kind != "cpu" else (1,)
-
-
-def lane_form(device: Device) -> dict:
-    """Return the constant that makes the kernels' vector form, or the form of one item a point."""
-    return {"VW": 16 if device.lanes > 1 else 1}
 
 
 def packets(device: Device, count: int) -> int:

@@ -14,7 +14,7 @@ from ..io.cleaning import first_of_duplicates
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from .patch_edges import ALONG
-from .patch_error import patch_distances
+from .patch_error import bound_of_all, patch_distances
 from .patch_limits import check_patches, check_spacing, least_width, most_of_mesh
 from .patch_strips import cells_beside, cut_graph, fitting_strips, joined, strip_faces, strip_frames
 from .quantize import quantized
@@ -314,7 +314,8 @@ def _with_bound(found: Conversion, diagonal: float) -> PatchSurface:
     upper, _ = _distances(found, _face_of_vertices(graph)[chosen], graph.vertices[chosen])
     upper = upper[np.isfinite(upper)]  # the others' patches are wholly transparent, as the scan is there
     bound = float(np.quantile(upper, BOUND_SHARE, method="higher")) if len(upper) else float("nan")
-    return replace(found.surface, diagonal=diagonal, bound=bound, bound_share=BOUND_SHARE)
+    return replace(found.surface, diagonal=diagonal, bound=bound, bound_share=BOUND_SHARE,
+                   bound_all=bound_of_all(found.surface, upper))
 
 
 def _rms(found: Conversion) -> float:

@@ -53,6 +53,12 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray,
     return upper, near
 
 
+def bound_of_all(surface: PatchSurface, distance: NDArray) -> float:
+    """Return the largest of the distances (n,), and half a step of the displacements; NaN for none, or one at inf."""
+    largest = float(distance.max(initial=-np.inf)) + float(surface.axis_z_length.max(initial=0)) / 2
+    return largest if np.isfinite(largest) else float("nan")
+
+
 def _to_cells(surface, patch, local, lengths) -> NDArray:
     """Return the least distance (n,) of points to the points over or nearest to them in the 5 x 5 cells around.
 

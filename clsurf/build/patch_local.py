@@ -15,7 +15,7 @@ from ..device import Device
 from ..errors import InputError
 from ..surface.patch import PatchSurface
 from ..surface.srgb import straight
-from .patch_error import patch_distances
+from .patch_error import bound_of_all, patch_distances
 from .patch_limits import widest_spacing
 from .patch_points import SheetPoints, sheet_points
 from .patch_regions import WIDEN, Regions, Sheet, beside, find_regions, missed_regions
@@ -124,7 +124,8 @@ def with_bound(surface: PatchSurface, points: SheetPoints, patch: NDArray) -> tu
     distance = distances(surface, points, patch)
     bound = float(np.quantile(distance, BOUND_SHARE, method="higher"))
     near = distance[distance <= bound]  # strays say nothing about the fit
-    return replace(surface, bound=bound, bound_share=BOUND_SHARE), float(np.sqrt(np.mean(near**2)))
+    return replace(surface, bound=bound, bound_share=BOUND_SHARE, bound_all=bound_of_all(surface, distance)), \
+        float(np.sqrt(np.mean(near**2)))
 
 
 def nothing_shows(points: SheetPoints, spacing: float, advice: str = "") -> InputError:

@@ -150,7 +150,8 @@ def _measured(scan: RangeScan, request, spacing: float, device: Device, progress
                         request.precise, origin=field.origin, diagonal=field.diagonal, bound_share=bound.share)
     rounding = float(surface.axis_z_length.max(initial=0)) / 2
     progress(1.0, "done")
-    return replace(surface, bound=bound.distance + rounding), bound.mean_square ** 0.5 / field.diagonal
+    return replace(surface, bound=bound.distance + rounding, bound_all=bound.largest + rounding), \
+        bound.mean_square ** 0.5 / field.diagonal
 
 
 def places_of(field: RangeField, fragments: Fragments, nodes, ratio: float) -> Places:
@@ -295,9 +296,13 @@ def distances(field: RangeField, fragments: Fragments, places: Places, pairs: ND
 
 @dataclass(frozen=True)
 class Bound:
-    """`share` of the samples lie within `distance` (world units); the mean square of theirs."""
+    """`share` of the samples lie within `distance` (world units), all within `largest`; the mean square of theirs.
+
+    `largest` is NaN where some have no patch within the tolerance.
+    """
 
     distance: float
+    largest: float
     share: float
     mean_square: float
 
@@ -316,5 +321,6 @@ def bound_of(scan: RangeScan, field: RangeField, fragments: Fragments, places: P
     found = np.sort(nearest[asked & np.isfinite(nearest)])
     share = np.floor(1000 * BOUND_SHARE * len(found) / max(1, int(asked.sum()))) / 1000
     rank = min(len(found), max(1, int(np.ceil(share * asked.sum())))) - 1
-    return Bound(float(found[rank]) if len(found) else float("nan"), float(share),
+    largest = float(found[-1]) if len(found) and len(found) == int(asked.sum()) else float("nan")
+    return Bound(float(found[rank]) if len(found) else float("nan"), largest, float(share),
                  float(np.mean(found ** 2)) if len(found) else float("inf"))

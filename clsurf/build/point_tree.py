@@ -84,6 +84,11 @@ class PointTree:
         return start.astype(np.int32), (last + 1).astype(np.int32), np.searchsorted(color[order], np.arange(9))
 
 
+def lane_form(device: Device) -> dict:
+    """Return the constant that makes the kernels' form of 16 lanes, or that of single items."""
+    return {"VW": 16 if device.lanes > 1 else 1}
+
+
 def build_point_tree(points: NDArray, normals: NDArray, middle: NDArray, scale: float, device: Device,
                      weights: NDArray | None = None) -> PointTree:
     """Sort points along the Morton curve of their box and build the tree over them.

@@ -113,19 +113,19 @@ def build_scale_map(thing, size: int = 128, center=None, radius: float | None = 
                     "centre, and %s; center=\"visible\" looks for a better centre", 100 * share,
                     f"what lies behind the first {layers} hits is lost" if layers > 1
                     else f"only the {hit} hits are kept")
-    bound = radial_bound(result, source.points)
+    bound, largest = radial_bounds(result, source.points)
     report(1.0)
     return ScaleMap(**{name: getattr(result, name) for name in ScaleMap.__dataclass_fields__}
-                    | {"bound": bound, "bound_share": BOUND_SHARE})
+                    | {"bound": bound, "bound_share": BOUND_SHARE, "bound_all": largest})
 
 
-def radial_bound(surface: ScaleMap, points: NDArray | None) -> float:
-    """Return the distance that the share `BOUND_SHARE` of points (n, 3), world, keep along rays from the centre.
+def radial_bounds(surface: ScaleMap, points: NDArray | None) -> tuple[float, float]:
+    """Return the distances that the share `BOUND_SHARE` and all of points (n, 3) keep along rays from the centre.
 
-    The nearest distance is no larger. NaN without points.
+    World units. The nearest distance is no larger. NaN without points.
     """
     if points is None or not len(points):
-        return float("nan")
+        return float("nan"), float("nan")
     points = points[::max(1, len(points) // 8_000)] - surface.center
     distance = np.linalg.norm(points, axis=1)
     points, distance = points[distance > 0], distance[distance > 0]
@@ -133,8 +133,12 @@ def radial_bound(surface: ScaleMap, points: NDArray | None) -> float:
     for k in range(surface.layers):
         there, known = interpolated(np.nan_to_num(surface.lambdas[k].astype(np.float64)), surface.valid[k], points)
         best = np.where(known, np.minimum(best, np.abs(there * surface.radius - distance)), best)
-    found = float(np.quantile(best, BOUND_SHARE, method="higher")) if len(best) else np.nan
-    return found if np.isfinite(found) else float("nan")
+    if not len(best):
+        return float("nan"), float("nan")
+    found, largest = float(np.quantile(best, BOUND_SHARE, method="higher")), float(best.max())
+    if surface.bits < 32:
+        largest += surface.radius / (2 * (2**surface.bits - 1))  # of codes between the points' own
+    return tuple(value if np.isfinite(value) else float("nan") for value in (found, largest))
 
 
 def check_options(size=128, bits=8, layers=1, hit="outermost", radius=None) -> None:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ..device.arrays import DeviceArray
 from ..surface.slim import COEFFICIENTS, SlimSurface, segment_end
 from ..surface.srgb import premultiplied, straight
-from .point_tree import BLOCK, FAR_POINT, PointTree
+from .point_tree import BLOCK, FAR_POINT, PointTree, lane_form
 from .project import leaf_tree, project_sorted
 from .radius import Noise
 
@@ -31,6 +31,7 @@ SPACINGS = (1.0, 0.5, 0.4, 0.3, 0.2)
 RECORD = 16  # floats a fitted surfel (fit_surfels.cl)
 BOUND_SHARE = 0.999  # of the scan's points lie within `bound` of the surface
 BOUND_SAMPLES = 1 << 16  # points that the bound is taken from
+ROUNDING = 2.0**-22  # diagonals: positions of a model in float32, and of what is drawn
 SEGMENT, FORCED, FIXED = 0, 1, 2  # modes of fit_surfels.cl
 
 
@@ -81,7 +82,7 @@ def build_levels(tree: PointTree, degree: int, penalty: float, noise: Noise, rep
     need = min(2 * min(terms, COEFFICIENTS[2]) + 2, tree.count)  # fewer over-fit; cubics become quadratics before
     choose = device.kernel("build/choose_centers.cl")
     weighted = {"WEIGHTED": 1} if tree.weighted else {}
-    fit = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree, **weighted})
+    fit = device.kernel("build/fit_surfels.cl", constants={"DEGREE": degree, **lane_form(device), **weighted})
     cover = device.kernel("build/cover_points.cl")
     mark_open = device.kernel("build/open_points.cl")
     blocks = tree.padded // BLOCK
@@ -195,7 +196,7 @@ def surfel_colors(tree: PointTree, center: NDArray, record: NDArray, colors: NDA
 
 
 def with_bound(surface: SlimSurface, tree: PointTree, middle: NDArray) -> SlimSurface:
-    """Return `surface` with the distance that BOUND_SHARE of the scan's points keep, from an even sample of them."""
+    """Return `surface` with the distances that BOUND_SHARE and all of an even sample of the scan's points keep."""
     device = tree.device
     blocks = tree.padded // BLOCK
     wanted = min(blocks, BOUND_SAMPLES // BLOCK)
@@ -208,4 +209,4 @@ def with_bound(surface: SlimSurface, tree: PointTree, middle: NDArray) -> SlimSu
     result = project_sorted(leaves, device.upload(queries), queries.shape[1], queries.shape[1])
     distance = np.abs(device.download(result, copy=False)[6, real])
     return replace(surface, bound=float(np.quantile(distance, BOUND_SHARE)) * surface.diagonal,
-                   bound_share=BOUND_SHARE)
+                   bound_share=BOUND_SHARE, bound_all=float(distance.max() + ROUNDING) * surface.diagonal)

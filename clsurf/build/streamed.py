@@ -25,7 +25,7 @@ from ..io.parts import part_folder, write_index, write_part
 from ..io.store import load_store
 from .patches import PatchRequest
 from .radius import Noise, automatic_error
-from .slim_levels import BOUND_SHARE, LEVELS
+from .slim_levels import BOUND_SHARE, LEVELS, ROUNDING
 from .stream_cells import (
     CellPoints,
     Coarse,
@@ -212,8 +212,10 @@ class Build:
         # Patches come with the bound of their cell: the largest holds for all.
         share = BOUND_SHARE if self.options.patches is None else 1.0
         bound = float(np.quantile(distance, share)) if len(distance) else float("nan")
+        largest = float(distance.max()) if len(distance) and self.options.patches is None else float("nan")
         values = {"degree": self.options.degree, "error": self.plan.error, "diagonal": self.plan.diagonal,
                   "bound": bound if np.isfinite(bound) else None, "bound_share": BOUND_SHARE, "oriented": True,
+                  "bound_all": largest + ROUNDING * self.plan.diagonal if np.isfinite(largest) else None,
                   "parts": len(about), "leaves": int(sum(one["leaves"] for one in about)),
                   "colored": bool(all(one["colored"] for one in about))}
         kind = "slim" if self.options.patches is None else "patches"

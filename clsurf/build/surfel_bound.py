@@ -14,11 +14,12 @@ BLENDED = 16  # base surfels about a place
 AROUND, WIDEST = 6, 1.75  # neighbours of a base surfel, and the angle between two that make a triangle with it
 
 
-def bound_of(scan, base: Base, device) -> float:
-    """Return the distance to the blended discs that BOUND_SHARE of an even sample of the scan keeps.
+def bounds_of(scan, base: Base, device) -> tuple[float, float]:
+    """Return the distances to the blended discs that BOUND_SHARE and all of an even sample of the scan keep.
 
     Of points; of the middles of faces, where there are any; and of places between base surfels on the surface that
-    their normals give, where tangent planes are farthest from what they touch.
+    their normals give, where tangent planes are farthest from what they touch. What is drawn blends discs where the
+    ray meets each, and at a silhouette one alone to its rim: the second takes all of the discs into account.
     """
     points = scan.points
     if isinstance(scan, Mesh) and len(scan.faces):
@@ -32,7 +33,25 @@ def bound_of(scan, base: Base, device) -> float:
     tree = box_tree(base.positions, device)
     if len(base.positions) > 3:
         places.append(between(base, tree))
-    return float(np.quantile(drawn_distance(np.concatenate(places), base, tree), BOUND_SHARE, method="higher"))
+    distance = drawn_distance(np.concatenate(places), base, tree)
+    return float(np.quantile(distance, BOUND_SHARE, method="higher")), max(float(distance.max()), at_rims(base, tree))
+
+
+def at_rims(base: Base, tree: BoxTree) -> float:
+    """Return how far the base surfels next to each other's discs say that these stand off at their rims.
+
+    The height of a neighbour over the disc's plane grows with the square of the way to it, as of quadratic surfaces.
+    """
+    own = evenly(np.arange(len(base.positions)), BOUND_SAMPLES)
+    at = nearest(tree, min(BLENDED, len(base.positions)), base.positions[own])[0]
+    positions, normals = base.positions.astype(np.float64), base.normals.astype(np.float64)
+    d = positions[at] - positions[own, None]
+    high = np.abs((d * normals[own, None]).sum(axis=2))
+    flat2 = np.maximum((d * d).sum(axis=2) - high * high, 0)
+    radius2 = base.radii[own, None].astype(np.float64) ** 2
+    same = (at >= 0) & ((normals[at] * normals[own, None]).sum(axis=2) > 0.5)
+    same &= (flat2 > radius2 / 4) & (flat2 <= radius2) & (high * high < radius2)
+    return float(np.max(high * radius2 / np.maximum(flat2, radius2 / 4), where=same, initial=0.0))
 
 
 def evenly(rows: NDArray, most: int) -> NDArray:

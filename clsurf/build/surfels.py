@@ -16,7 +16,7 @@ from ..surface.ranges import RangeScan
 from ..surface.srgb import straight
 from ..surface.surfel import SurfelHierarchy
 from .slim import face_normals, parse_bytes, vertex_colors
-from .surfel_bound import BOUND_SHARE, bound_of
+from .surfel_bound import BOUND_SHARE, bounds_of
 from .surfel_maps import LARGEST_MAP, draw_maps, light_of
 from .surfel_points import base_surfels, unit
 from .surfel_tree import Tree, cluster, discs_of
@@ -122,6 +122,7 @@ def pure_parts(scan, spacing, device, report) -> tuple[dict, int]:
     discs = discs_of(tree, base.positions, base.normals, base.radii, base.colors)
     inner, n = len(tree.start), len(base.positions)
     order = tree.order
+    bound, largest = bounds_of(scan, base, device)
     join = lambda above, below: np.concatenate([above, below]).astype(np.float32)  # noqa: E731
     child_offset, children = tree_links(tree, n)
     lights = None if base.colors is None else join(discs.colors, base.colors[order])
@@ -131,7 +132,7 @@ def pure_parts(scan, spacing, device, report) -> tuple[dict, int]:
         heights=join(discs.heights, np.zeros(n)), spreads=join(discs.spreads, np.zeros(n)),
         level=np.concatenate([tree.level, np.full(n, tree.level.max() + 1)]), child_offset=child_offset,
         children=children, lights=lights, colors=None if lights is None else straight(lights.astype(np.float64)),
-        spacing=base.spacing, bound=bound_of(scan, base, device), bound_share=BOUND_SHARE), inner
+        spacing=base.spacing, bound=bound, bound_share=BOUND_SHARE, bound_all=largest), inner
 
 
 def widened(spheres):
@@ -189,4 +190,5 @@ def hybrid_parts(mesh: Mesh, spacing, device, report) -> tuple[dict, int]:
         colors=None if discs.colors is None else straight(discs.colors),
         vertices=np.where(finite[:, None], mesh.vertices, 0), vertex_normals=normals,
         vertex_colors=vertex_colors(mesh), triangles=faces[tree.order[at]],
-        triangle_offset=triangle_offset, spacing=float(np.median(edges)), bound=0.0, bound_share=1.0), len(tree.start)
+        triangle_offset=triangle_offset, spacing=float(np.median(edges)), bound=0.0, bound_share=1.0,
+        bound_all=0.0), len(tree.start)

@@ -41,7 +41,7 @@ class ChannelPicture:
 
 def channel_picture(channel: str, legend: bool, limit: float, lines: str, out: Path) -> ChannelPicture | None:
     """Return the picture by a channel that the options ask for, None without one, or raise InputError."""
-    from ..render.renderer import checked_channels
+    from ..render.checked import checked_channels
     if not channel:
         if legend or limit:
             raise InputError(f"--{'legend' if legend else 'limit'}: an option of --channel: name one")

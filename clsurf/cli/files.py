@@ -139,8 +139,10 @@ def _about_scale_map(surface) -> None:
 
 
 def _bound(surface) -> str:
-    return "not stored" if math.isnan(surface.bound) else \
-        f"{surface.bound:g} for {surface.bound_share:.1%} of the scan's points"
+    if math.isnan(surface.bound):
+        return "not stored"
+    rest = "" if math.isnan(surface.bound_all) else f", {surface.bound_all:g} for all"
+    return f"{surface.bound:g} for {surface.bound_share:.1%} of the scan's points{rest}"
 
 
 def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB XYZ PTS CSV NPY LAS LAZ, or range "

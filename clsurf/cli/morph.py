@@ -29,7 +29,7 @@ def morph(first: Annotated[Path, typer.Argument(help="A mesh, a surface or a sca
 
     from ..build.morph import morph_frames
     from ..io.video import ENDINGS, known_video, write_video
-    from ..render.renderer import checked_size
+    from ..render.checked import checked_size
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     ending = out.suffix.lower()
     if ending not in (*ENDINGS, "", ".clsurf"):

@@ -141,7 +141,7 @@ def render(source: SourceArgument,
     import clsurf
 
     from ..device import Profile
-    from ..render.renderer import checked_channels, checked_lod, checked_size
+    from ..render.checked import checked_channels, checked_lod, checked_size
     # Every option is checked before the work.
     seen_from = direction or eye or target or (fov, ortho) != (None, None)
     moving = motion(out, turntable, path, frames, fps, camera, ignore_distortion, bool(seen_from), scheduler)
@@ -218,7 +218,7 @@ def report(source: SourceArgument,
     """Write one HTML page about a surface and a view of it: counts, operations, times, the picture."""
     import clsurf
 
-    from ..render.renderer import checked_lod, checked_size
+    from ..render.checked import checked_lod, checked_size
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     checked_out(out, (".html", ".htm"))
     view = checked_view(direction, up, fov, eye, target, ortho)

@@ -29,7 +29,7 @@ def trace(source: Annotated[Path, typer.Argument(help="A surface, a mesh, or ano
     """Find where rays hit a surface or a mesh."""
     import clsurf
 
-    from ..render.renderer import checked_size
+    from ..render.checked import checked_size
     from ..trace.hits import QUERIES
     # Every option is checked before the work.
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))

@@ -39,7 +39,7 @@ def view(sources: Annotated[list[str], typer.Argument(help="Surfaces or scans, s
     """Look at surfaces and scans: turn, measure, cut, take pictures; h shows the keys."""
     import clsurf
 
-    from ..render.renderer import checked_size
+    from ..render.checked import checked_size
     from ..sizes import checked_budget
     from ..view.canvas import BACKENDS, backend_module, chosen_backend
     # Every option is checked before the work.

@@ -26,6 +26,10 @@ _TOO_LARGE = (cl.status_code.INVALID_BUFFER_SIZE, cl.status_code.MEM_OBJECT_ALLO
 # Fastest first: a dragon frame took 9.4 ms on Intel's runtime and 10.3 on PoCL 3.0, its build 0.21 and 0.25 s.
 CPU_ORDER = ("intel", "pocl", "portable", "llvmpipe", "oclgrind")
 TRANSLATED = ("rusticl", "Oclgrind")  # platforms that take clang's output on, in which some builtins have no name
+# Processors whose driver wants single items. llvmpipe makes a loop of every scalar that is read or written, 16 loops of
+# a vector of 16 lanes, and compiling takes the square of their number: knn_covariance 1 s in place of over 100,
+# fit_surfels 3 s in place of 334. It runs 8 items as lanes by itself.
+SINGLE = ("llvmpipe",)
 WORDS = {"pocl": ("portable", "pocl"), "intel": ("intel",), "nvidia": ("nvidia",), "amd": ("amd", "advanced micro")}
 
 
@@ -53,6 +57,8 @@ class Device:
     memory_bytes, largest_buffer_bytes, local_bytes : int
     lanes : int
         Default kernel form: vector lanes of one work-item (16, 8 or 4), or 1 for a work-group per tile.
+    group_items : int
+        Items that run side by side: those of a launch without groups of its own are put together by so many.
     profile : Profile or None
         Set to a `Profile` to have every launch timed (each then waits for the one before).
     """
@@ -66,7 +72,9 @@ class Device:
         self.units = cl_device.max_compute_units
         self.memory_bytes, self.largest_buffer_bytes = cl_device.global_mem_size, cl_device.max_mem_alloc_size
         self.local_bytes = cl_device.local_mem_size
-        self.lanes = 16 if self.kind == "cpu" else 1
+        self.lanes = 16 if self.kind == "cpu" and not any(word in self.name.lower() for word in SINGLE) else 1
+        # llvmpipe runs 8 as lanes (58 balls of fit_surfels: 0.15 s, 1.4 one by one); where lanes are 16, one is enough.
+        self.group_items = 1 if self.lanes > 1 else 8 if self.kind == "cpu" else 64
         self.profile: Profile | None = None
         self.own_constants = {"TRANSLATED": 1} if self.platform_name in TRANSLATED else {}
         if "Portable" in self.platform_name:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import time
 import warnings
 from collections import defaultdict
@@ -16,6 +17,8 @@ from .sources import argument_dtypes, kernel_text
 
 # -w: PoCL prints its compiler's warnings straight to the terminal.
 BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable", "-w"]
+# What a kernel says whose answer may depend on how its items are grouped.
+GROUPED = re.compile(r"\bget_(?:local|group|num_groups|global_size)|\bbarrier\b|reqd_work_group|\b(?:__)?local\b")
 
 
 class Kernel:
@@ -25,8 +28,8 @@ class Kernel:
     buffers, `pyopencl.LocalMemory`, or numbers, which are cast to the kernel's own types.
     """
 
-    def __init__(self, device, kernel, label, dtypes):
-        self.device, self.kernel, self.label = device, kernel, label
+    def __init__(self, device, kernel, label, dtypes, free=False):
+        self.device, self.kernel, self.label, self.free = device, kernel, label, free
         kernel.set_scalar_arg_dtypes(dtypes)
         self.count = len(dtypes)
 
@@ -48,14 +51,25 @@ class Kernel:
     def _launch(self, global_size, local_size, arguments) -> None:
         profile = self.device.profile
         if profile is None:
-            cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, global_size, local_size)
+            self._enqueue(global_size, local_size)
             self.device.in_flight.append(arguments)
             return
         self.device.queue.finish()
         start = time.perf_counter()
-        cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, global_size, local_size)
+        self._enqueue(global_size, local_size)
         self.device.queue.finish()
         profile.add(self.label, time.perf_counter() - start)
+
+    def _enqueue(self, global_size, local_size) -> None:
+        """Launch; items that are asked for one by one go in groups where the device runs those side by side."""
+        queue, items = self.device.queue, self.device.group_items
+        if not (self.free and items > 1 and local_size == (1,) and global_size[0] >= items):
+            cl.enqueue_nd_range_kernel(queue, self.kernel, global_size, local_size)
+            return
+        whole = global_size[0] // items * items
+        cl.enqueue_nd_range_kernel(queue, self.kernel, (whole,), (items,))
+        if whole < global_size[0]:  # no more items than asked for: not every kernel looks at its number
+            cl.enqueue_nd_range_kernel(queue, self.kernel, (global_size[0] - whole,), (1,), (whole,))
 
 
 class Profile:
@@ -110,4 +124,5 @@ def build_program(device, path: str, constants: dict | None):
 
 def make_kernel(device, program, text, name) -> Kernel:
     """Return a kernel object of `program` for the calling thread."""
-    return Kernel(device, cl.Kernel(program, name), name, argument_dtypes(text, name))
+    free = not GROUPED.search(re.sub(r"//[^\n]*", "", text))
+    return Kernel(device, cl.Kernel(program, name), name, argument_dtypes(text, name), free)

@@ -26,7 +26,7 @@ from .layout import from_arrays, to_arrays
 from .store_arrays import VERSION, create_array, read_arrays
 
 KINDS = {"slim_parts": "slim", "patches_parts": "patches"}  # and the kind of their parts
-SHARED = ("degree", "error", "diagonal", "bound", "bound_share", "oriented")
+SHARED = ("degree", "error", "diagonal", "bound", "bound_share", "bound_all", "oriented")
 CHUNK_BYTES = 1 << 20
 
 
@@ -129,12 +129,13 @@ def joined_patches(parts: list[PatchSurface], shared: dict) -> PatchSurface:
     whole = [part for part in parts if len(part)] or parts[:1]
     gather = lambda name: np.concatenate([getattr(part, name) for part in whole])  # noqa: E731
     origin = parts[0].origin
-    bound = shared.get("bound")
+    number = lambda name: float("nan") if shared.get(name) is None else float(shared[name])  # noqa: E731
     return PatchSurface(np.concatenate([part.origins + (part.origin - origin) for part in whole]), gather("axis_x"),
                         gather("axis_y"), gather("axis_z_length"), gather("size"), gather("displacements"),
                         None if whole[0].colors is None else gather("colors"), origin=origin,
-                        diagonal=float(shared["diagonal"]), bound=float("nan") if bound is None else bound,
-                        bound_share=float(shared["bound_share"]), oriented=all(part.oriented for part in whole))
+                        diagonal=float(shared["diagonal"]), bound=number("bound"),
+                        bound_share=float(shared["bound_share"]), bound_all=number("bound_all"),
+                        oriented=all(part.oriented for part in whole))
 
 
 def read_parts(path: Path, group: zarr.Group, members) -> SlimSurface | PatchSurface:

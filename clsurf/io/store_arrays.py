@@ -37,24 +37,32 @@ def read_arrays(path: Path, group: zarr.Group, members: "Members", prefix: str =
     names = [key.removesuffix("/zarr.json") for key in keys if key.endswith("/zarr.json")]
     found = {name: item for name, item in ((name, group[name]) for name in names) if isinstance(item, zarr.Array)}
     for name, array in found.items():
-        _check_array(path, prefix + name, array, members)
+        check_array(path, prefix + name, array, members)
     return {name: np.asarray(array[...]) for name, array in found.items()}
 
 
-def _check_array(path: Path, name: str, array: zarr.Array, members: "Members") -> None:
-    """Refuse an array whose chunks are missing or cannot hold what it declares, before memory is taken."""
+def check_plain(path, name: str, array: zarr.Array) -> int:
+    """Refuse an array of another type or encoding than is written, or with absurd chunks; return a chunk's bytes."""
     codecs = array.metadata.codecs
     plain = array.dtype.kind in "biuf" and all(isinstance(codec, BytesCodec | BloscCodec) for codec in codecs)
     if not plain or len(codecs) != 2:
         raise FileFormatError(f"{path}: {name}: unexpected type {array.dtype} or encoding {codecs!r}")
     chunk_bytes = array.dtype.itemsize * math.prod(array.chunks)
+    if chunk_bytes > _LARGEST_CHUNK:
+        raise FileFormatError(f"{path}: {name}: chunks of {chunk_bytes:,} bytes: damaged")
+    return chunk_bytes
+
+
+def check_array(path: Path, name: str, array: zarr.Array, members: "Members") -> None:
+    """Refuse an array whose chunks are missing or cannot hold what it declares, before memory is taken."""
+    chunk_bytes = check_plain(path, name, array)
     count = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True))
     prefix = f"{name}/c/" if array.shape else f"{name}/c"
     chunks = [key for key in members.sizes if key.startswith(prefix)]
     stored = sum(members.sizes[key] for key in chunks)
     if len(chunks) != count:
         raise FileFormatError(f"{path}: {name}: expected {count:,} chunks, got {len(chunks):,}: truncated or damaged")
-    if chunk_bytes > _LARGEST_CHUNK or array.nbytes > _MOST_COMPRESSED * (stored + 4096):
+    if array.nbytes > _MOST_COMPRESSED * (stored + 4096):
         raise FileFormatError(f"{path}: {name}: shape {array.shape} does not fit in {stored:,} stored bytes: damaged")
     for key in chunks:
         head = members.head(key)
@@ -94,12 +102,13 @@ class ZipMembers(Members):
 
 
 class FolderMembers(Members):
-    """Those of a folder."""
+    """Those of a folder, or of the folder `inside` it alone."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, inside: str = ""):
         self._path = path
-        self.sizes = {p.relative_to(path).as_posix(): p.stat().st_size for p in path.rglob("*") if p.is_file()}
-        if "zarr.json" not in self.sizes:
+        found = (path / inside).rglob("*")
+        self.sizes = {p.relative_to(path).as_posix(): p.stat().st_size for p in found if p.is_file()}
+        if not inside and "zarr.json" not in self.sizes:
             raise FileFormatError(f"{path}: a folder, but not a .clsurf store: it has no zarr.json")
 
     def head(self, key: str) -> bytes:

@@ -13,11 +13,12 @@ from zarr.storage import LocalStore, ZipStore
 from clsurf.errors import Error, FileFormatError, InputError
 from clsurf.sizes import checked_budget
 from clsurf.surface.placed import Placed, placed
-from clsurf.surface.slim import SlimSurface
+from clsurf.surface.slim import COEFFICIENTS, SlimSurface
 
-from . import parts
+from . import parts, store_arrays
 from .files import one_line
 from .layout import from_arrays
+from .store_arrays import FolderMembers, Members
 from .stored_leaves import StoredLeaves
 
 # A store on the web cannot be listed.
@@ -27,6 +28,8 @@ OPTIONAL = ("footprint", "colors")
 # What zarr, its codecs and the data types raise for damaged parts; a server that fails raises others.
 _DAMAGED = (ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError)
 BUDGET = "1GB"
+# Where files cannot be measured before they are read, as on the web; 600 MB of floats. Parts have 30M or fewer.
+_MOST_NUMBERS = 150_000_000
 
 
 class StoredSurface:
@@ -42,7 +45,7 @@ class StoredSurface:
 
     Attributes
     ----------
-    degree, error, diagonal, bound, bound_share
+    degree, error, diagonal, bound, bound_share, bound_all
         As those of `SlimSurface`.
     part_bounds : (k, 2, 3) float64
         World boxes of the parts; part 0 holds the coarse levels of all.
@@ -79,7 +82,8 @@ class StoredSurface:
     def _describe(self) -> None:
         values = self._values
         self.degree, self.error, self.diagonal = int(values["degree"]), values["error"], float(values["diagonal"])
-        self.bound = float("nan") if values.get("bound") is None else float(values["bound"])
+        self.bound, self.bound_all = (float("nan") if values.get(name) is None else float(values[name])
+                                      for name in ("bound", "bound_all"))
         self.bound_share = float(values.get("bound_share", 1.0))
         if self._single:
             whole = self.read(0)
@@ -87,9 +91,11 @@ class StoredSurface:
             self.surfels = np.bincount(whole.level, minlength=26)[None, 1:]
             self.colored, self.origin = whole.colors is not None, whole.origin
         else:
-            self.part_bounds, self.surfels = self._group["bounds"][...], self._group["surfels"][...]
+            count = int(values["parts"])
+            self.part_bounds = self._checked("bounds", (count, 2, 3))[...]
+            self.surfels = self._checked("surfels", (count, -1))[...]
             self.colored = bool(values.get("colored"))
-            self.origin = self._group["parts/00000/origin"][...]
+            self.origin = self._checked("parts/00000/origin", (3,))[...]
 
     @property
     def bounds(self) -> NDArray:
@@ -121,17 +127,63 @@ class StoredSurface:
         values = dict(group.attrs["values"])
         rows = None if levels is None or self._single else int(self.surfels[part, :levels].sum())
         names = [*NAMES, *(name for name in OPTIONAL if name in group)]
+        held = self._part_arrays(part, names)
         if rows is None:
-            return from_arrays("slim", {name: group[name][...] for name in names}, values)
+            return from_arrays("slim", {name: array[...] for name, array in held.items()}, values)
         whole = ("origin", "child_offset", "children")
-        arrays = {name: group[name][...] if name == "origin" else group[name][:rows]
-                  for name in names if name not in whole[1:]}
-        offset = group["child_offset"][:rows + 1]
-        children = group["children"][:int(offset[-1])]
+        arrays = {name: array[...] if name == "origin" else array[:rows]
+                  for name, array in held.items() if name not in whole[1:]}
+        offset = held["child_offset"][:rows + 1]
+        children = held["children"][:int(offset[-1])]
         keep = children < rows
         arrays["child_offset"] = np.concatenate([[0], np.cumsum(keep)])[offset].astype(np.int32)
         arrays["children"] = children[keep]
         return from_arrays("slim", arrays, values)
+
+    def _part_arrays(self, part: int, names: list[str]) -> dict[str, zarr.Array]:
+        """Return the arrays of a part, refused before they are read where they do not fit its surfels."""
+        prefix = "" if self._single else f"parts/{part:05d}/"
+        count = int(self._group["radii"].shape[0] if self._single else self.surfels[part].sum())
+        members = self._members(prefix)
+        try:
+            out = {}
+            for name in names:
+                wide = {"origin": (3,), "child_offset": (count + 1,), "children": (-1,), "centers": (count, 3),
+                        "normals": (count, 2), "coefficients": (count, COEFFICIENTS[self.degree]),
+                        "footprint": (count, 8), "colors": (count, 4)}.get(name, (count,))
+                out[name] = self._checked(prefix + name, wide, members)
+            return out
+        finally:
+            if members is not None:
+                members.close()
+
+    def _members(self, inside: str) -> Members | None:
+        """Return the sizes of the files in the folder `inside`, of all where it is empty; None: not known."""
+        if "://" in self.place:
+            return None
+        path = Path(self.place).expanduser()
+        return FolderMembers(path, inside) if path.is_dir() else store_arrays.zip_members(path)
+
+    def _checked(self, name: str, shape: tuple, members: Members | None = None) -> zarr.Array:
+        """Return an array of the store, refused where it has another shape (-1: any) or cannot have it."""
+        array = self._group[name]
+        if not isinstance(array, zarr.Array) or array.ndim != len(shape) or any(
+                want not in (-1, got) for got, want in zip(array.shape, shape, strict=True)):
+            raise FileFormatError(f"{self.place}: {name}: expected the shape {shape}, got "
+                                  f"{getattr(array, 'shape', 'a group')}: damaged")
+        own = members is None
+        members = self._members(name) if members is None else members
+        if members is None:
+            store_arrays.check_plain(self.place, name, array)
+            if array.size > _MOST_NUMBERS:
+                raise FileFormatError(f"{self.place}: {name}: the shape {array.shape} is absurd: damaged")
+            return array
+        try:
+            store_arrays.check_array(Path(self.place), name, array, members)
+        finally:
+            if own:
+                members.close()
+        return array
 
     def leaves(self) -> StoredLeaves:
         """Return the leaves, which are read where they are asked for; those used last stay in memory."""

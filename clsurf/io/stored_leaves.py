@@ -113,7 +113,8 @@ def only(surface: SlimSurface, keep: NDArray) -> SlimSurface:
 def side_by_side(surfaces: list[SlimSurface], stored) -> SlimSurface:
     """Return surfaces without links as one, with the numbers of the whole one they are parts of."""
     if len(surfaces) == 1:
-        return replace(surfaces[0], diagonal=stored.diagonal, bound=stored.bound, bound_share=stored.bound_share)
+        return replace(surfaces[0], diagonal=stored.diagonal, bound=stored.bound, bound_share=stored.bound_share,
+                       bound_all=stored.bound_all)
     origin = surfaces[-1].origin  # of a cell; that of part 0 may be far away
     gather = lambda name: np.concatenate([getattr(one, name) for one in surfaces])  # noqa: E731
     names = ("radii", "normals", "coefficients", "level", "leaf", "fit_error")
@@ -126,7 +127,7 @@ def side_by_side(surfaces: list[SlimSurface], stored) -> SlimSurface:
     count = sum(len(one) for one in surfaces)
     return SlimSurface(
         degree=stored.degree, error=stored.error, origin=origin, diagonal=stored.diagonal, bound=stored.bound,
-        bound_share=stored.bound_share, oriented=all(one.oriented for one in surfaces),
+        bound_share=stored.bound_share, bound_all=stored.bound_all, oriented=all(one.oriented for one in surfaces),
         centers=np.concatenate([one.centers + (one.origin - origin) for one in surfaces]).astype(np.float32),
         child_offset=np.zeros(count + 1, np.int32), children=np.zeros(0, np.int32),
         **{name: gather(name) for name in names}, **optional)

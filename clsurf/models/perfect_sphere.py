@@ -74,11 +74,12 @@ def perfect_sphere(patches: int = PATCHES, radius: float = RADIUS, nodes: int = 
         step, middle = max(step * spacing, least), (heights.min() + heights.max()) / 2
         displacements = np.rint((heights - middle) / step)
     corner = np.array([-half, -half, middle])
+    bound = radius * _bound(middle + step * displacements, offset)
     return PatchSurface(origins=radius * np.einsum("a,pax->px", corner, frames),
                         axis_x=radius * spacing * frames[:, 0], axis_y=radius * spacing * frames[:, 1],
                         axis_z_length=np.full(patches, radius * step), size=(nodes, nodes),
                         displacements=np.tile(displacements.astype(np.int8).ravel(), patches), color=color,
-                        diagonal=2 * np.sqrt(3) * radius, bound=radius * _bound(middle + step * displacements, offset))
+                        diagonal=2 * np.sqrt(3) * radius, bound=bound, bound_all=bound)
 
 
 def _fitted(heights, offset, least):

@@ -18,30 +18,29 @@ from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
-from .average import average, fine_channels
-from .backdrop import around, checked_background, lay_over
+from .average import average
+from .backdrop import around, lay_over
 from .bands import draw_in_bands
 from .camera import Camera
-from .checked import checked_channels, checked_lod, checked_size, picture_bytes
-from .clip import checked_clip, view_clip
-from .coverage import FACTOR, checked_antialias, cover_edges, edge_channels, edge_layout, mark_edges
-from .differentials import NAME, check_differentials, split_differentials, wanted_differentials
+from .checked import picture_bytes
+from .clip import view_clip
+from .coverage import FACTOR, cover_edges, edge_layout, mark_edges
+from .differentials import NAME, check_differentials, split_differentials
 from .eye_dome import eye_dome
 from .frame import Frame
 from .lighting import OWN_COLORS, prepared_lighting, surface_shading, wants_lighting
 from .mesh import draw_mesh, upload_mesh
-from .mirror import CHANNELS as MIRROR_CHANNELS
-from .mirror import reflect, wants_mirror
+from .mirror import reflect
 from .patch_drawing import PatchDrawing
 from .patch_tiles import tile_bins_of_patches
 from .patches import draw_patches, shade_patches, upload_patches
 from .pieces import CloudPiece, draw_pieces, halves, upload_piece
 from .point_drawing import PointDrawing
 from .points import draw_points, is_unlit, upload_cloud
+from .request import Request, checked_request
 from .resident import Resident, resident_scene
 from .scale_map import draw_scale_map, upload_scale_map
 from .scale_map_drawing import ScaleMapDrawing
-from .scene import as_scene
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
@@ -55,10 +54,6 @@ KINDS = {SlimSurface: (upload_slim, draw_slim), PatchSurface: (upload_patches, d
          SurfelHierarchy: (upload_surfels, draw_surfels), ScaleMap: (upload_scale_map, draw_scale_map),
          Mesh: (upload_mesh, draw_mesh), PointCloud: (upload_cloud, draw_points),
          RangeScan: (upload_cloud, draw_points), CloudPiece: (upload_piece, draw_points)}
-# Made and checked once: 14 us.
-DEFAULT_SHADING = Shading()
-DEFAULT_DRAWINGS = {"patches": PatchDrawing(), "slim": SlimDrawing(), "surfels": SurfelDrawing(),
-                    "scale_map": ScaleMapDrawing(), "points": PointDrawing()}
 
 
 class Renderer:
@@ -173,93 +168,90 @@ class Renderer:
         DeviceError
             The renderer is closed, or the device lacks memory even for a band of the picture.
         """
+        self._check_usable()
+        asked = checked_request(scene, size, channels, shading, lod, background, supersampling,
+                                {"patches": patches, "slim": slim, "surfels": surfels, "scale_map": scale_map,
+                                 "points": points}, clip, antialias)
+        samples = asked.samples(asked.size)
+        camera = framing(asked.scene, samples) if camera is None else camera
+        if not isinstance(camera, Camera):
+            raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
+        scene, self.complete = resident_scene(asked.scene, self._residents, camera, samples, asked.lod, self._resident)
+        check_differentials(scene.placed, asked.curved, asked.shading.look, asked.drawings["slim"])
+        own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
+        try:
+            return self._drawn(asked, scene, camera)
+        finally:
+            self.device.profile = own_profile
+
+    def _check_usable(self) -> None:
         if self._scratch is None:
             raise DeviceError("renderer: it is closed: make a new Renderer")
         if self.device.process != os.getpid():
             raise DeviceError("renderer: it was made before this process was forked: make a new Renderer")
-        scene, size, channels, lod = as_scene(scene), checked_size(size), checked_channels(channels), checked_lod(lod)
-        (factor, covered), clip = checked_antialias(antialias, supersampling), checked_clip(clip)
-        picture, size = size, checked_size([n * factor for n in size])
-        asked, channels = channels, fine_channels(channels, factor)
-        curved = wanted_differentials(channels)
-        channels, wanted = ([name for name in names if name in CHANNELS] for names in (channels, asked))
-        shading = DEFAULT_SHADING if shading is None else Shading(look=shading) if isinstance(shading, str) else shading
-        if not isinstance(shading, Shading):
-            raise InputError(f"shading: expected a clsurf.Shading or the name of a look, got {shading!r}")
-        covered = covered and "color" in channels
-        if covered:
-            channels = edge_channels(channels, len(scene.surfaces))
-        back = checked_background(background, scene)
-        if wants_mirror(scene, shading, channels):
-            channels = list(dict.fromkeys([*channels, *MIRROR_CHANNELS]))
-        patches, slim, surfels, scale_map, points = (
-            checked_drawing(name, given) for name, given in (
-                ("patches", patches), ("slim", slim), ("surfels", surfels), ("scale_map", scale_map),
-                ("points", points)))
-        camera = self._framing(scene, size) if camera is None else camera
-        if not isinstance(camera, Camera):
-            raise InputError(f"camera: expected a clsurf.Camera, got {camera!r}")
-        scene, self.complete = resident_scene(scene, self._residents, camera, size, lod, self._resident)
-        check_differentials(scene.placed, curved, shading.look, slim)
 
-        def draw(scene, camera, picture):
-            size, drawn = tuple(n * factor for n in picture), channels
-            # The stages of a frame.
-            placed, origin = scene.placed, scene_origin(scene)
-            early = wants_lighting(scene, shading, drawn)
-            mirrored, lighting = wants_mirror(scene, shading, drawn), None
-            if early or covered or mirrored:
-                lighting = prepared_lighting(self.device, scene, shading, camera)
-            if lighting and len(lighting.materials) > 1:
-                drawn = list(dict.fromkeys([*drawn, "id"]))
-            at_once = len(placed) == 1 and isinstance(placed[0][0], PatchSurface) and not early
-            at_once &= all(surface not in self._pieces for surface, _ in placed)
-            grid = self._new_grid(placed, size, drawn, curved, shading, patches, points, view_clip(clip, camera),
-                                  early, at_once, lighting)
-            floats = shading_floats(shading, scene.lights, back.color, camera)
-            whole = view_floats(camera, size, offset=camera.eye - origin)
-            lamps = None if at_once and not covered else self.device.upload(floats)
-            look = Look(shading, lod, patches, slim, surfels, scale_map, lamps, "cost" in channels, points)
-            if at_once:
-                (surface, matrix), = placed
-                arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
-                                       whole, floats, drawn)
-            else:
-                self._draw(grid, scene, camera, look, floats, lighting if early else None, factor)
-                arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), look.lamps,
-                               "phong" if early else shading.look, drawn)
-            if covered:
-                edges, large = mark_edges(self.device, self._scratch, grid, self.device.upload(whole), arrays,
-                                          edge_layout(grid.layout, len(lighting.materials)))
-                self._draw(large, scene, camera, replace(look, lod=FACTOR * lod, cost=False), floats, lighting, FACTOR)
-                cover_edges(self.device, large, edges, self.device.upload(floats[8:12]), arrays["color"])
-            if mirrored:
-                reflect(self.device, scene, camera, shading, around(back, scene), origin, floats, lighting, arrays)
-            if factor > 1:
-                arrays = average(self.device, arrays, picture, factor, wanted, curved, self._scratch.lanes)
-            if "color" in wanted:
-                lay_over(self.device, back, camera, picture, arrays["color"], self._scratch.lanes)
-            arrays = self.device.download_all(arrays)
-            arrays |= split_differentials(arrays.pop(NAME), curved) if curved else {}
-            return Frame({name: arrays[name] for name in asked}, origin, camera)
+    def _drawn(self, asked: Request, scene, camera: Camera) -> Frame:
+        """Return the frame of a scene that is in memory; in parts where the device does not hold it at once."""
+        def draw(scene, camera, size):
+            return self._frame(asked, scene, camera, size)
 
-        cull = not shading.shadows and not shading.occlusion and not wants_mirror(scene, shading, channels)
-        own_profile, self.device.profile = self.device.profile, self.profile or self.device.profile
         try:
-            try:
-                return draw(scene, camera, picture)
-            except DeviceMemoryError as error:
-                failed = error
-            if self._cut(scene):
-                with contextlib.suppress(DeviceMemoryError):
-                    return draw(scene, camera, picture)
-            # Bands and the picture they make are in memory together, with room for what draws them.
-            if not scene.surfaces or 3 * picture_bytes(picture, asked) > host_memory_bytes():
-                raise failed
-            self._give_back()
-            return draw_in_bands(draw, scene, camera, picture, cull)
-        finally:
-            self.device.profile = own_profile
+            return draw(scene, camera, asked.size)
+        except DeviceMemoryError as error:
+            failed = error
+        if self._cut(scene):
+            with contextlib.suppress(DeviceMemoryError):
+                return draw(scene, camera, asked.size)
+        # Bands and the picture they make are in memory together, with room for what draws them.
+        if not scene.surfaces or 3 * picture_bytes(asked.size, asked.channels) > host_memory_bytes():
+            raise failed
+        self._give_back()
+        cull = not asked.shading.shadows and not asked.shading.occlusion and not asked.mirrored
+        return draw_in_bands(draw, scene, camera, asked.size, cull)
+
+    def _frame(self, asked: Request, scene, camera: Camera, picture: tuple[int, int]) -> Frame:
+        """Return the frame of `picture` (width, height): the stages of a frame, in their order."""
+        shading, channels, size = asked.shading, asked.sampled, asked.samples(picture)
+        early, lighting = wants_lighting(scene, shading, channels), None
+        if early or asked.covered or asked.mirrored:
+            lighting = prepared_lighting(self.device, scene, shading, camera)
+        if lighting and len(lighting.materials) > 1:
+            channels = list(dict.fromkeys([*channels, "id"]))
+        at_once = len(scene.placed) == 1 and isinstance(scene.placed[0][0], PatchSurface) and not early
+        at_once &= all(surface not in self._pieces for surface, _ in scene.placed)
+        grid = self._new_grid(asked, scene.placed, size, channels, view_clip(asked.clip, camera), early, at_once,
+                              lighting)
+        origin, floats = scene_origin(scene), shading_floats(shading, scene.lights, asked.back.color, camera)
+        whole = view_floats(camera, size, offset=camera.eye - origin)
+        lamps = None if at_once and not asked.covered else self.device.upload(floats)
+        look = Look(shading, asked.lod, lamps=lamps, cost="cost" in channels, **asked.drawings)
+        if at_once:
+            (surface, matrix), = scene.placed
+            arrays = shade_patches(self.device, self._scratch, grid, self._uploaded(surface), matrix, camera, look,
+                                   whole, floats, channels)
+        else:
+            self._draw(grid, scene, camera, look, floats, lighting if early else None, asked.factor)
+            arrays = shade(self.device, self._scratch, grid, self.device.upload(whole), lamps,
+                           "phong" if early else shading.look, channels)
+        if asked.covered:
+            self._cover(grid, scene, camera, look, whole, floats, lighting, arrays)
+        if asked.mirrored:
+            reflect(self.device, scene, camera, shading, around(asked.back, scene), origin, floats, lighting, arrays)
+        if asked.factor > 1:
+            arrays = average(self.device, arrays, picture, asked.factor, asked.kept, asked.curved,
+                             self._scratch.lanes)
+        if "color" in asked.kept:
+            lay_over(self.device, asked.back, camera, picture, arrays["color"], self._scratch.lanes)
+        arrays = self.device.download_all(arrays)
+        arrays |= split_differentials(arrays.pop(NAME), asked.curved) if asked.curved else {}
+        return Frame({name: arrays[name] for name in asked.channels}, origin, camera)
+
+    def _cover(self, grid: Grid, scene, camera, look: Look, whole, floats, lighting, arrays) -> None:
+        """Draw the pixels at edges of a picture `arrays` again, finer."""
+        edges, large = mark_edges(self.device, self._scratch, grid, self.device.upload(whole), arrays,
+                                  edge_layout(grid.layout, len(lighting.materials)))
+        self._draw(large, scene, camera, replace(look, lod=FACTOR * look.lod, cost=False), floats, lighting, FACTOR)
+        cover_edges(self.device, large, edges, self.device.upload(floats[8:12]), arrays["color"])
 
     def _draw(self, grid: Grid, scene, camera, look: Look, floats, lighting, factor: int) -> None:
         """Draw all surfaces of a scene into a grid's planes; light them there where `lighting` says how.
@@ -294,13 +286,9 @@ class Renderer:
                 return parts is not None
         return False
 
-    def _framing(self, scene, size) -> Camera:
-        thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-        return Camera.framing(thing, aspect=size[0] / size[1])
-
-    def _new_grid(self, placed, size, channels, curved, shading, patches, points, clip, early: bool, at_once: bool,
-                  lighting) -> Grid:
+    def _new_grid(self, asked: Request, placed, size, channels, clip, early: bool, at_once: bool, lighting) -> Grid:
         """Return bins that nothing has touched yet; `at_once`: only their places."""
+        shading, patches, points = asked.shading, asked.drawings["patches"], asked.drawings["points"]
         colored = shading.model_colors and any(carries_colors(s) for s, _ in placed)
         colored |= shading.look.startswith("ball") or points.attribute is not None
         unlit = any(is_unlit(s, points, shading) for s, _ in placed)
@@ -309,7 +297,7 @@ class Renderer:
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed) and (lighting is None or lighting.plain)
         layout = Layout(color=(colored or lit or early or unlit) and "color" in channels, id="id" in channels,
                         count="count" in channels, level="level" in channels, lit=lit, traced=early,
-                        clip_planes=len(clip), unlit=unlit and "color" in channels, differentials=curved)
+                        clip_planes=len(clip), unlit=unlit and "color" in channels, differentials=asked.curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * (not at_once),
@@ -379,13 +367,10 @@ def scene_origin(scene) -> np.ndarray:
     return surface.origin.copy() if matrix is None else matrix[:3, :3] @ surface.origin + matrix[:3, 3]
 
 
-def checked_drawing(name: str, given):
-    """Return how a kind is drawn, the default where nothing is given, or raise InputError."""
-    drawing = DEFAULT_DRAWINGS[name] if given is None else given
-    kind = type(DEFAULT_DRAWINGS[name])
-    if not isinstance(drawing, kind):
-        raise InputError(f"{name}: expected a clsurf.{kind.__name__}, got {drawing!r}")
-    return drawing
+def framing(scene, size) -> Camera:
+    """Return the camera that a picture of `size` gets where none is given: one that frames the scene."""
+    thing = scene if np.isfinite(scene.bounds).all() else np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    return Camera.framing(thing, aspect=size[0] / size[1])
 
 
 def render(scene, camera: Camera | None = None, size: tuple[int, int] = (1024, 768),

@@ -61,8 +61,8 @@ class Shading:
         With "matcap"; see `Material`.
     shadows : bool
         With "phong" and "physical": the scene's lights throw hard shadows, but for a headlight, which has none, and an
-        image, whose shadows are its occlusion. All surfaces throw and receive them (patches that `PatchDrawing` lights
-        at their nodes receive none).
+        image, whose shadows are its occlusion. All surfaces and meshes throw and receive them (patches that
+        `PatchDrawing` lights at their nodes receive none), clouds and range images receive them only.
     occlusion : int
         With "phong" and "physical": directions above a surface along which ambient occlusion looks for SLIM surfaces
         (32 to 256); what an image light sends along those that are open is the part of its light that is seen,

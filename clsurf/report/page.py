@@ -14,9 +14,10 @@ from ..errors import InputError
 from ..io.files import replacing
 from ..io.images import png_bytes, to_srgb8
 from ..render.camera import Camera
+from ..render.checked import checked_lod, checked_size
 from ..render.frame import Frame
 from ..render.patch_drawing import PatchDrawing
-from ..render.renderer import Renderer, checked_lod, checked_size
+from ..render.renderer import Renderer
 from ..render.scale_map_drawing import ScaleMapDrawing
 from ..render.scene import Scene, as_scene
 from ..render.surfel_drawing import SurfelDrawing

@@ -49,6 +49,9 @@ class PatchSurface:
         Diagonal of the scan's bounding box without outliers, world units; NaN: that of the nodes.
     bound, bound_share : float
         The distance (world units) within which the surface lies of the share `bound_share` of the scan's points.
+    bound_all : float
+        The same for all that was measured, strays included: the largest distance, and half a step of the
+        displacements. NaN: not known, as where a part of the scan has no patch.
     oriented : bool
         False: the side that axis_z points to means nothing (two-sided).
 
@@ -70,6 +73,7 @@ class PatchSurface:
     diagonal: float = float("nan")  # world units
     bound: float = float("nan")  # world units
     bound_share: float = 1.0
+    bound_all: float = float("nan")  # world units
     oriented: bool = True
 
     def __post_init__(self):

@@ -47,6 +47,9 @@ class ScaleMap:
         Diagonal of the scan's bounding box, world units.
     bound, bound_share : float
         The distance (world units) within which the surface lies of the share `bound_share` of the scan's points.
+    bound_all : float
+        The same for all that was measured: the largest distance, and half a step of the codes. NaN: not known, as
+        where the map has holes.
 
     Raises
     ------
@@ -64,6 +67,7 @@ class ScaleMap:
     diagonal: float = 1.0  # world units
     bound: float = float("nan")  # world units
     bound_share: float = 1.0
+    bound_all: float = float("nan")  # world units
 
     def __post_init__(self):
         put = lambda name, *rest: object.__setattr__(self, name, frozen(name, getattr(self, name), *rest))  # noqa: E731

@@ -56,6 +56,8 @@ class SlimSurface:
         Diagonal of the scan's bounding box without outliers, world units.
     bound, bound_share : float
         The distance (world units) within which the surface lies of the share `bound_share` of the scan's points.
+    bound_all : float
+        The same for all that was measured, strays included: the largest distance, and a rounding. NaN: not known.
     footprint : (n, 8) uint8, optional
         Support of the surfel's own points: (u, v) lies inside where u cos(k pi/4) + v sin(k pi/4) is at most
         footprint[k] / 255 of the radius for k = 0...7; 255 everywhere: not limited.
@@ -85,6 +87,7 @@ class SlimSurface:
     diagonal: float = 1.0  # world units
     bound: float = float("nan")  # world units
     bound_share: float = 1.0
+    bound_all: float = float("nan")  # world units
     footprint: NDArray | None = None  # (n, 8) uint8
     colors: NDArray | None = None  # (n, 4) uint8 sRGB
     oriented: bool = True

@@ -64,6 +64,8 @@ class SurfelHierarchy:
         The distance (world units) within which the finest level, as it is drawn, lies of the share `bound_share` of
         the scan: of its points, its faces, and the surface between points that their normals give. Coarser levels lie
         up to `heights` farther off.
+    bound_all : float
+        The same for all that was measured, with every disc taken to its rim, whatever it is blended with.
 
     Raises
     ------
@@ -94,6 +96,7 @@ class SurfelHierarchy:
     spacing: float = float("nan")  # world units
     bound: float = float("nan")  # world units
     bound_share: float = 1.0
+    bound_all: float = float("nan")  # world units
 
     def __post_init__(self):
         put = lambda name, *rest: object.__setattr__(self, name, frozen(name, getattr(self, name), *rest))  # noqa: E731

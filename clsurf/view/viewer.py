@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from ..errors import DeviceError, InputError
 from ..render.camera import Camera
+from ..render.checked import checked_size
 from ..render.point_drawing import PointDrawing
 from ..render.points import is_unlit
-from ..render.renderer import Renderer, checked_size
+from ..render.renderer import Renderer
 from ..render.scene import Scene, as_scene
 from ..render.shade import Shading
 from . import picture

@@ -56,11 +56,11 @@ __kernel void fit_quartics(int surfels, int padded_surfels, __global const int *
       solve(&sums, terms, a);
       for (int i = 0; i < TERMS; ++i) left -= a[i] * right[i]; // of the squared heights: rounded, but good enough here
       if (terms < TERMS || left < allowed) break; // too few points to tell which are wrong, or nothing is
-      float16 sum = 0.0f, sum2 = 0.0f, sum4 = 0.0f;
-      EACH_NEAR(float16 basis[TERMS]; basis_at(u, v, basis); float16 e = distance_from(a, basis, w); float16 e2 = e * e;
+      PF sum = 0.0f, sum2 = 0.0f, sum4 = 0.0f;
+      EACH_NEAR(PF basis[TERMS]; basis_at(u, v, basis); PF e = distance_from(a, basis, w); PF e2 = e * e;
                 if (inverse_cut2 > 0.0f) g *= weight_within(e, inverse_cut2);
                 sum += g; sum2 += g * e2; sum4 += g * e2 * e2;)
-      float all = total(sum), square = total(sum2) / all, fourth = total(sum4) / all;
+      float all = sum_lanes(sum), square = sum_lanes(sum2) / all, fourth = sum_lanes(sum4) / all;
       if (!(fourth > HEAVY * square * square)) break;
       inverse_cut2 = 1.0f / (CUT * CUT * square);
     }

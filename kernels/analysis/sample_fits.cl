@@ -39,10 +39,10 @@ __kernel void sample_fits(int samples, int radii, __global const int *center, __
   o[5] = 0.0f;
 #if RESIDUAL
   solve(&sums, 10, a);
-  float16 sum = 0.0f;
-  EACH_NEAR(float16 b[TERMS]; basis_at(u, v, b); float16 e = w;
+  PF sum = 0.0f;
+  EACH_NEAR(PF b[TERMS]; basis_at(u, v, b); PF e = w;
             for (int i = 0; i < 10; ++i) e -= a[i] * b[i];
             sum += g * e * e;)
-  o[5] = total(sum) / weight * radius * radius;
+  o[5] = sum_lanes(sum) / weight * radius * radius;
 #endif
 }

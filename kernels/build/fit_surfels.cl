@@ -1,4 +1,5 @@
-// One surfel per work-item: all radii of its golden-ratio segment at once, a radius per vector lane.
+// One surfel per work-item: all radii of its golden-ratio segment at once, a radius per vector lane; where items are
+// single (VW = 1), one after another.
 //
 // Lane i has the radius r_r g^(2 (14 - i) / 14), g the golden ratio: lane 0 is r_l, 7 is r_m, 14 is r_r (paper 003,
 // equations 3-5); lane 15 repeats 14. All share the frame of the mean normal within r_m. Two passes over the ball's
@@ -43,7 +44,7 @@
 #define ANY_NORMAL ((float4)(0.0f, 0.0f, 0.0f, 0.0f)) // of gather_ball's side
 
 #ifdef WEIGHTED
-#define TIMES_WEIGHT(g, i, p) g *= ((const float *)ball->k)[16 * (i) + (p)];
+#define TIMES_WEIGHT(g, i, p) g *= ((const float *)ball->k)[PW * (i) + (p)];
 #else
 #define TIMES_WEIGHT(g, i, p)
 #endif
@@ -76,12 +77,12 @@ inline Frame frame_of_ball(const Ball *ball, float3 own_normal) {
   return f;
 }
 
-// 16 points in the frame, in units of the ball's radius: u, v, w and d^2, points as lanes.
+// Points in the frame, in units of the ball's radius: u, v, w and d^2, points as lanes.
 typedef struct {
-  union { float16 v; float s[16]; } u, v, w, d2;
+  union { PF v; float s[PW]; } u, v, w, d2;
 } Chunk;
 
-inline void local_chunk(Chunk *c, float16 x, float16 y, float16 z, const Frame *f, float inverse_r) {
+inline void local_chunk(Chunk *c, PF x, PF y, PF z, const Frame *f, float inverse_r) {
   x *= inverse_r, y *= inverse_r, z *= inverse_r;
   c->u.v = f->ux * x + f->uy * y + f->uz * z;
   c->v.v = f->vx * x + f->vy * y + f->vz * z;
@@ -89,8 +90,8 @@ inline void local_chunk(Chunk *c, float16 x, float16 y, float16 z, const Frame *
   c->d2.v = x * x + y * y + z * z;
 }
 
-#define CHUNKS(count) (((count) + 15) / 16)
-#define IN_CHUNK(count, i) ((count) - 16 * (i) < 16 ? (count) - 16 * (i) : 16)
+#define CHUNKS(count) (((count) + PW - 1) / PW)
+#define IN_CHUNK(count, i) ((count) - PW * (i) < PW ? (count) - PW * (i) : PW)
 
 // Sums of G u^i v^j (moment) and G u^i v^j w (right) for the lanes' radii. The monomials are made with points as lanes,
 // then each point's are broadcast to the lanes of radii: one multiply-add a sum, a point and all radii.
@@ -101,12 +102,12 @@ inline void sum_moments(const Ball *ball, const Frame *frame, float inverse_r, V
   for (int i = 0; i < CHUNKS(ball->count); ++i) {
     Chunk c;
     local_chunk(&c, ball->x[i], ball->y[i], ball->z[i], frame, inverse_r);
-    union { float16 v; float s[16]; } m[MOMENTS + TERMS];
+    union { PF v; float s[PW]; } m[MOMENTS + TERMS];
     MONOMIALS
     int points = IN_CHUNK(ball->count, i);
     for (int p = 0; p < points; ++p) {
-      VF g = weight_of(c.d2.s[p], inverse_r2);
-      n -= g > 0.0f;
+      VF g = weight_of(POINT(c.d2, p), inverse_r2);
+      n += ONES(g > 0.0f);
       TIMES_WEIGHT(g, i, p)
       ADD_SUMS
     }
@@ -123,9 +124,9 @@ inline VF mean_residual2(const Ball *ball, const Frame *frame, float inverse_r, 
     local_chunk(&k, ball->x[i], ball->y[i], ball->z[i], frame, inverse_r);
     int points = IN_CHUNK(ball->count, i);
     for (int p = 0; p < points; ++p) {
-      VF g = weight_of(k.d2.s[p], inverse_r2);
+      VF g = weight_of(POINT(k.d2, p), inverse_r2);
       TIMES_WEIGHT(g, i, p)
-      VF f = k.w.s[p] - height_at(c, k.u.s[p], k.v.s[p]);
+      VF f = POINT(k.w, p) - height_at(c, POINT(k.u, p), POINT(k.v, p));
       sum += g * f * f;
       total += g;
     }
@@ -158,19 +159,19 @@ inline void fit_polynomials(const VF *moment, const VF *right, VF r, VI count, i
 
 #define EACH_CHUNK(body)                                                                              \
   {                                                                                                   \
-    size_t n16 = padded / 16;                                                                         \
+    size_t n = padded / PW;                                                                           \
     uint list[BLOCK_LIST];                                                                            \
     Traversal t;                                                                                      \
     int blocks;                                                                                       \
     traversal_start(&t, top_level);                                                                   \
     while ((blocks = traversal_next(&t, boxes, node_offset, x, y, z, radius * radius, list)) > 0)     \
-      for (int b = 0; b < blocks; ++b) {                                                              \
-        __global const float16 *block = (__global const float16 *)sorted + list[b];                   \
+      for (int b = 0; b < BLOCK_POINTS * blocks; ++b) {                                               \
+        __global const PF *block = (__global const PF *)sorted + NUMBER_IN(list, b);                  \
         Chunk c;                                                                                      \
-        local_chunk(&c, block[0] - x, block[n16] - y, block[2 * n16] - z, frame, inverse_r);          \
-        float16 g = 1.0f - c.d2.v;                                                                    \
-        g = SEL(g, (float16)0.0f, g < 0.0f);                                                          \
-        g = POINT_WEIGHT(g * g * g, block, n16);                                                      \
+        local_chunk(&c, block[0] - x, block[n] - y, block[2 * n] - z, frame, inverse_r);              \
+        PF g = 1.0f - c.d2.v;                                                                         \
+        g = SEL(g, (PF)0.0f, g < 0.0f);                                                               \
+        g = POINT_WEIGHT(g * g * g, block, n);                                                        \
         body                                                                                          \
       }                                                                                               \
   }
@@ -183,10 +184,10 @@ inline float fit_all_points(int padded, __global const float *sorted, __global c
   float inverse_r = 1.0f / radius;
   VF moment[MOMENTS], right[TERMS], sum = 0.0f, total = 0.0f;
   VF SUMS;
-  EACH_CHUNK(union { float16 v; } m[MOMENTS + TERMS]; MONOMIALS ADD_LANES)
+  EACH_CHUNK(union { PF v; } m[MOMENTS + TERMS]; MONOMIALS ADD_LANES)
   STORE_LANES
   fit_polynomials(moment, right, (VF)1.0f, (VI)FULL, TERMS, coefficient);
-  EACH_CHUNK(float16 f = c.w.v - height_at(coefficient, c.u.v, c.v.v); sum += g * f * f; total += g;)
+  EACH_CHUNK(PF f = c.w.v - height_at(coefficient, c.u.v, c.v.v); sum += g * f * f; total += g;)
   return sum_lanes(sum) / (sum_lanes(total) + 1e-30f);
 }
 
@@ -203,22 +204,40 @@ inline float turn_to_plane(const Frame *f, VF *normal, VF *c) {
 }
 #endif
 
-// The fits of all lanes: error and energy in unit-diagonal units, coefficients in units of the ball's radius.
+// The fits of all radii: error and energy in unit-diagonal units, coefficients in units of the ball's radius.
 typedef struct {
   Frame frame;
-  VF c[TERMS], weight; // weight: the sum of G over the points
-  union { VF v; float s[16]; } e2, energy;
-  union { VI v; int s[16]; } count;
+  union { float16 v; float s[16]; } c[TERMS], weight, e2, energy; // weight: the sum of G over the points
+  union { int16 v; int s[16]; } count;
 } Fits;
 
-inline void fit_lanes(Fits *fits, const Ball *ball, float3 own_normal, float radius, VF r, int terms, float lambda_t2) {
-  VF inverse_r2 = 1.0f / (r * r), moment[MOMENTS], right[TERMS];
+// Radii over the ball's: g^(2 (14 - i) / 14).
+#define RATIOS 0.381966011f, 0.409151886f, 0.438272665f, 0.469466063f, 0.502879599f, 0.538671289f, 0.577010394f, \
+               0.618033989f, 0.662021714f, 0.709140230f, 0.759612349f, 0.813676760f, 0.871589122f, 0.933623281f, \
+               1.0f, 1.0f
+__constant float RATIO[16] = {RATIOS};
+
+inline void fit_radii(Fits *fits, const Ball *ball, float3 own_normal, float radius, int terms, float lambda_t2) {
   fits->frame = frame_of_ball(ball, own_normal);
-  sum_moments(ball, &fits->frame, 1.0f / radius, inverse_r2, moment, right, &fits->count.v);
-  fit_polynomials(moment, right, r, fits->count.v, terms, fits->c);
-  fits->weight = moment[0];
-  fits->e2.v = mean_residual2(ball, &fits->frame, 1.0f / radius, inverse_r2, fits->c) * (radius * radius);
-  fits->energy.v = fits->e2.v + inverse_r2 * (lambda_t2 / (radius * radius));
+  for (int i = 0; i < 16; i += VW) {
+#if VW == 1
+#define OF_RADIUS(value) (value).s[i]
+    float r = RATIO[i];
+#else
+#define OF_RADIUS(value) (value).v
+    VF r = (VF)(RATIOS);
+#endif
+    VF inverse_r2 = 1.0f / (r * r), moment[MOMENTS], right[TERMS], c[TERMS];
+    VI count;
+    sum_moments(ball, &fits->frame, 1.0f / radius, inverse_r2, moment, right, &count);
+    fit_polynomials(moment, right, r, count, terms, c);
+    VF e2 = mean_residual2(ball, &fits->frame, 1.0f / radius, inverse_r2, c) * (radius * radius);
+    for (int k = 0; k < TERMS; ++k) OF_RADIUS(fits->c[k]) = c[k];
+    OF_RADIUS(fits->count) = count;
+    OF_RADIUS(fits->weight) = moment[0];
+    OF_RADIUS(fits->e2) = e2;
+    OF_RADIUS(fits->energy) = e2 + inverse_r2 * (lambda_t2 / (radius * radius));
+  }
 }
 
 // The first lane with at least `need` points; 14 where none has.
@@ -263,17 +282,17 @@ inline void write_disc(__global float *o, float radius, float3 normal) {
 
 // Radius of a point's own disc: up to the nearest point that its plane does not come within the tolerance of.
 inline float stray_radius(const Ball *ball, float3 normal, float radius, float tolerance) {
-  float16 nearest = LARGEST_STRAY * LARGEST_STRAY * radius * radius;
+  PF nearest = LARGEST_STRAY * LARGEST_STRAY * radius * radius;
   for (int i = 0; i < CHUNKS(ball->count); ++i) {
-    float16 x = ball->x[i], y = ball->y[i], z = ball->z[i];
-    float16 f = normal.x * x + normal.y * y + normal.z * z, d2 = x * x + y * y + z * z;
-    int16 real = LANE_INDEX < (int16)IN_CHUNK(ball->count, i);
+    PF x = ball->x[i], y = ball->y[i], z = ball->z[i];
+    PF f = normal.x * x + normal.y * y + normal.z * z, d2 = x * x + y * y + z * z;
+    PI real = LANE_INDEX < (PI)IN_CHUNK(ball->count, i);
     nearest = SEL(nearest, d2, real & ((f > tolerance) | (f < -tolerance)) & (d2 < nearest));
   }
-  union { float16 v; float s[16]; } lanes;
+  union { PF v; float s[PW]; } lanes;
   lanes.v = nearest;
   float least = lanes.s[0];
-  for (int j = 1; j < 16; ++j) least = lanes.s[j] < least ? lanes.s[j] : least;
+  for (int j = 1; j < PW; ++j) least = lanes.s[j] < least ? lanes.s[j] : least;
   float smallest = STRAY_DISC * radius * sqrt(3.14159265f / ball->count), clear = CLEAR * sqrt(least);
   return clear > smallest ? clear : smallest;
 }
@@ -295,9 +314,6 @@ inline void write_surfel(__global float *o, const Frame *frame, const VF *coeffi
     o[6 + k] = ((float *)&c[k])[0] * scale[TERM_U[k] + TERM_V[k]];
 }
 
-#define GATHER(side)                                                                                           \
-  gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius, side)
-
 // Sparse places. A ball with too few points grows, to twice its size or to SPARSE point spacings, and makes do with a
 // plane if it then still has too few; a point that is nearly alone gets a disc. Where the points fill less than half of
 // the ball (an island), the next levels' smaller balls decide: grown, it would bridge to the next surface. A leaf that
@@ -313,51 +329,52 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
   float x = own[0], y = own[n], z = own[2 * n];
   float3 own_normal = (float3)(own[3 * n], own[4 * n], own[5 * n]);
   Ball ball;
-  float radius = r_r;
-  int terms = TERMS, may_refit = mode != FIXED;
-  GATHER(ANY_NORMAL);
-  int wide = r_r > SPARSE * spacing, compact = wide && ball.extent2 < COMPACT * r_r * r_r;
-  if (compact && mode == SEGMENT) mode = INNER;
-  int enough = need < FULL ? FULL : need;
-  if (ball.count < enough) {
-    float limit = compact ? r_r : wide ? 2.0f * r_r : SPARSE * spacing;
-    if (mode == SEGMENT) mode = FORCED;
-    int alone = wide && ball.count < (compact ? 2 : COMPANY);
-    while (!alone && ball.count < enough && 1.25f * radius <= limit) {
-      radius *= 1.25f;
-      GATHER(ANY_NORMAL);
-    }
-    if (alone || (wide && !compact && ball.count < need)) {
-      write_disc(out + RECORD * (size_t)s, LONE_DISC * spacing, own_normal);
-      return;
-    }
-    if (ball.count < need) {
-      need = 1, terms = 3;
-      if (mode == FORCED) mode = FIXED; // no choice among radii that hold two or three points
-    }
-  }
-  // Lanes' radii over the ball's: g^(2 (14 - i) / 14).
-  VF r = (VF)(0.381966011f, 0.409151886f, 0.438272665f, 0.469466063f, 0.502879599f, 0.538671289f, 0.577010394f,
-              0.618033989f, 0.662021714f, 0.709140230f, 0.759612349f, 0.813676760f, 0.871589122f, 0.933623281f, 1.0f,
-              1.0f);
   Fits fits;
-  int leaf, lane;
-  for (int attempt = 0; attempt < 2; ++attempt) {
-    fit_lanes(&fits, &ball, own_normal, radius, r, terms, lambda_t2);
+  float4 side = ANY_NORMAL;
+  float radius = r_r, limit = r_r; // up to which the ball may grow
+  int terms = TERMS, enough = need < FULL ? FULL : need, may_refit = mode != FIXED, refitted = 0;
+  int wide = r_r > SPARSE * spacing, compact = 0, sparse = 0, alone = 0, leaf, lane;
+  // A loop about one place that gathers and one that fits: compilers make a copy of all of it where it is called twice.
+  for (int first = 1;; first = 0) {
+    gather_ball(&ball, padded, sorted, boxes, node_offset, top_level, x, y, z, radius, NORMAL_SHARE * radius, side);
+    if (refitted) {
+      need = ball.count < need ? ball.count : need;
+      if (need < TERMS) need = 1, terms = 3, mode = FIXED;
+    } else {
+      if (first) {
+        compact = wide && ball.extent2 < COMPACT * r_r * r_r;
+        if (compact && mode == SEGMENT) mode = INNER;
+        sparse = ball.count < enough;
+        if (sparse && mode == SEGMENT) mode = FORCED;
+        limit = compact ? r_r : wide ? 2.0f * r_r : SPARSE * spacing;
+        alone = sparse && wide && ball.count < (compact ? 2 : COMPANY);
+      }
+      if (!alone && ball.count < enough && 1.25f * radius <= limit) {
+        radius *= 1.25f;
+        continue;
+      }
+      if (alone || (sparse && wide && !compact && ball.count < need)) {
+        write_disc(out + RECORD * (size_t)s, LONE_DISC * spacing, own_normal);
+        return;
+      }
+      if (ball.count < need) {
+        need = 1, terms = 3;
+        if (mode == FORCED) mode = FIXED; // no choice among radii that hold two or three points
+      }
+    }
+    fit_radii(&fits, &ball, own_normal, radius, terms, lambda_t2);
     lane = choose_lane(&fits, lambda, need, mode, ball.stride, &leaf);
     int no_smaller = mode != SEGMENT || fits.count.s[0] < need;
-    if (!may_refit || !leaf || !no_smaller || ball.stride > 1 || !is_plateau(&fits, lane, 0.0f)) break;
-    may_refit = 0;
-    GATHER((float4)(own_normal, OTHER_SHEET));
-    need = ball.count < need ? ball.count : need;
-    if (need < TERMS) need = 1, terms = 3, mode = FIXED;
+    if (refitted || !may_refit || !leaf || !no_smaller || ball.stride > 1 || !is_plateau(&fits, lane, 0.0f)) break;
+    refitted = 1;
+    side = (float4)(own_normal, OTHER_SHEET);
   }
 #ifndef WEIGHTED
   // Evenly spread points weigh a quarter of their number; a stray whose neighbours all lie near the rim fits itself.
-  if (leaf && wide && mode == SEGMENT && ((float *)&fits.weight)[lane] < 0.125f * need) leaf = 0, lane = 14;
+  if (leaf && wide && mode == SEGMENT && fits.weight.s[lane] < 0.125f * need) leaf = 0, lane = 14;
 #endif
   if (leaf) { // what keeps farther from its points than allowed is split; what cannot be, is a disc at its point
-    float most = WITHIN_ERROR * tolerance, aside = ((float *)&fits.c[0])[lane] * radius;
+    float most = WITHIN_ERROR * tolerance, aside = fits.c[0].s[lane] * radius;
     int splits = mode == SEGMENT && fits.count.s[0] >= need;
     if (fits.e2.s[lane] > most * most && splits) leaf = 0, lane = 14;
     else if (fits.e2.s[lane] > most * most || aside > tolerance || aside < -tolerance) {
@@ -365,13 +382,13 @@ __kernel void fit_surfels(int surfels, __global const int *center, float r_r, fl
       return;
     }
   }
-  float error2 = fits.e2.s[lane], share = ((float *)&r)[lane];
+  float error2 = fits.e2.s[lane], share = RATIO[lane];
   if (wide && radius > r_r && mode == FORCED && error2 > POOR * POOR * radius * radius) { // strays, no sparse surface
     leaf = 0;
     share = r_r / radius;
   }
   VF c[TERMS];
-  for (int k = 0; k < TERMS; ++k) c[k] = ((float *)&fits.c[k])[lane];
+  for (int k = 0; k < TERMS; ++k) c[k] = fits.c[k].s[lane];
   if (ball.stride > 1) { // a thinned ball chose the radius; the surfel is fitted to all points
     for (int k = 0; k < TERMS; ++k) c[k] = 0.0f;
     error2 = fit_all_points(padded, sorted, boxes, node_offset, top_level, x, y, z, share * radius, &fits.frame, c);

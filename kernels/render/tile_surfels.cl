@@ -1,9 +1,11 @@
-// Draw the surfels of every bin into its depth and attribute planes: perspective-correct discs, normals from their maps.
+// Draw the surfels of every bin into its depth and attributes: perspective-correct discs, normals from their maps.
 //
 // Pass 1 finds the frontmost disc of every pixel; of a base surfel its inner part counts, of an inner surfel where its
-// map is covered, which trims silhouettes and holes. Where that is seen from behind and the rest of a disc seen from its
-// front lies before it, the latter is taken: a closed surface shows its inside through gaps only. Pass 2 blends what lies about as deep and is seen from the same
-// side, weighted by (1 - t^2)^3, which is close to a Gaussian of the distance t from the disc's middle over its radius.
+// map is covered, which trims silhouettes and holes. Where that is seen from behind and the rest of a disc seen from the
+// front lies before it, the latter is taken: a closed surface shows its inside through gaps only. Pass 2 blends what
+// lies about as deep and is seen from the same side, weighted by (1 - t^2)^3, which is close to a Gaussian of the
+// distance t from the disc's middle over its radius. What a surface shows does not depend on others in the planes: they
+// only spare it discs that could not come to lie in front of them.
 //
 // VW > 1: one work-item per tile of TILE_BINS^2 bins, lanes over blocks of 4x4 pixels (8 lanes: 4x2, 4: 4x1).
 // VW = 1: one work-group of 64 work-items per tile, each a pixel of the bin at hand.
@@ -107,17 +109,19 @@ INLINE void fetch_for_blend(__global const float *k, VF u, VF v, VF where, __glo
 #endif
 }
 
-// Pass 1: the largest K between `smallest` and `largest`, in front of those in `best`, its side and its surfel;
+// Pass 1: the largest K between `smallest` and `largest`, its side and its surfel; what has K under `behind` cannot show.
 // (rx, ry, rz) are the rays, model space. Of private pairs those remain whose discs lie over a pixel, `*total` of them.
 INLINE int frontmost(PAIRS pairs, int *total, uint block, float bucket, __global const float *records,
                      __global const uint *atlas, VF px, VF py, VF rx, VF ry, VF rz, VF smallest, VF largest,
-                     VF *best, VF *at, VF *facing, VI *nearest, VF *whole /* frontmost disc seen from its front, rest and
+                     VF behind, VF *best, VF *at, VF *facing, VI *nearest, VF *whole /* frontmost disc seen from its front, rest and
                      all */, VI *whole_nearest, int *cost) {
   int more = 1, count = *total, kept = 0;
   for (int e = 0; e < count; e++) {
     uint2 pair = pairs[e];
     float near = near_of_key(pair.y) - bucket;
-    VI open = IS_PERSPECTIVE ? near * *best < 1.0f : near < -*best;
+    // A disc seen from behind lets one before it show that is there already.
+    VI open = IS_PERSPECTIVE ? (near * *best < 1.0f) & ((near * behind < 1.0f) | (*whole > behind))
+                             : (near < -*best) & ((near < -behind) | (*whole > behind));
     if (!any_lane(open)) { KEEP_REST(e, count) count = 0; more = 0; continue; }  // PoCL is slower with a break
     SKIP(pair, block)
     __global const float *k = records + (size_t)INDEX_OF(pair) * RECORD_FLOATS;
@@ -238,12 +242,13 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
     largest = SEL(infinite, 1.0f / low, low > 0.0f);
     smallest = SEL(infinite, 1.0f / high, high > 0.0f);
   } else { largest = -low; smallest = -high; }
-  VF best = IS_PERSPECTIVE ? 1.0f / before : -before, first = 0.0f, facing = 0.0f;
+  VF best = IS_PERSPECTIVE ? 0.0f : -infinite, first = 0.0f, facing = 0.0f;
+  VF behind = IS_PERSPECTIVE ? 1.0f / (before + slack) : -(before + slack);
   VF rx = 0.0f, ry = 0.0f;
   if (IS_PERSPECTIVE) { rx = (px - view[CX]) * (1.0f / view[FX]); ry = (view[CY] - py) * (1.0f / view[FY]); }
   VF ray_x = view[0] * rx + view[3] * ry - view[6], ray_y = view[1] * rx + view[4] * ry - view[7];
   VF ray_z = view[2] * rx + view[5] * ry - view[8];
-  VF whole = IS_PERSPECTIVE ? 0.0f : -infinite;
+  VF whole = best;
   VI nearest = 0, whole_nearest = 0;
   int cost = 0;
   Blend sum;
@@ -252,14 +257,14 @@ INLINE int draw_block(__global const float *view, __global const uint2 *pairs, i
 #if VW == 1
   int all = count;
   frontmost(pairs, &all, 1u << quarter, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest,
-            largest, &best, &first, &facing, &nearest, &whole, &whole_nearest, &cost);
+            largest, behind, &best, &first, &facing, &nearest, &whole, &whole_nearest, &cost);
 #else
   uint2 kept[SEGMENT];
   int more = 1, n = 0;
   for (int from = 0; from < count && more; from += SEGMENT) {
     n = filtered(pairs + from, count - from < SEGMENT ? count - from : SEGMENT, quarter, kept);
     more = frontmost(kept, &n, 0u, view[BUCKET_DEPTH], records, atlas, px, py, ray_x, ray_y, ray_z, smallest, largest,
-                     &best, &first, &facing, &nearest, &whole, &whole_nearest, &cost);
+                     behind, &best, &first, &facing, &nearest, &whole, &whole_nearest, &cost);
   }
 #endif
   VI through = (facing < 0.0f) & (whole > first);
