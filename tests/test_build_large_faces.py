@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation, binary_erosion
+from test_render_triangles import globe
 
 from clsurf.analysis.error import error, surface_samples
-from clsurf.build.large_faces import large_faces, longest2, with_middles
+from clsurf.build.large_faces import coarse_edges, large_faces, longest2, with_edges, with_middles
 from clsurf.build.slim import build_slim, face_normals
+from clsurf.render.camera import Camera
+from clsurf.render.renderer import render
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
@@ -77,3 +81,35 @@ def test_weight_of_a_mesh_with_large_faces(device):
     surface = build_slim(mesh, weight=weight, device=device)
     assert surface.leaf.any() and np.isfinite(surface.bound)
     assert surface.bound == pytest.approx(build_slim(mesh, device=device).bound, rel=1)
+
+
+def test_edges_of_meshes_that_are_coarse_for_their_curvature():
+    ball, fine = globe(6, 12), globe(40, 80)
+    edges = coarse_edges(ball.vertices, ball.vertices, ball.faces)  # 30 degrees from one to the next
+    assert len(edges) == len({tuple(sorted(e)) for f in ball.faces.tolist() for e in ((f[0], f[1]), (f[1], f[2]),
+                                                                                    (f[2], f[0]))})
+    assert not len(coarse_edges(fine.vertices, fine.vertices, fine.faces))
+    assert not len(coarse_edges(ball.vertices, ball.vertices, ball.faces[:0]))
+    colors = np.tile(np.uint8([[10, 20, 31, 255]]), (len(ball.vertices), 1))
+    weights = np.linspace(1, 2, len(ball.vertices), dtype=np.float32)
+    position, normals, colors, weights = with_edges(ball.vertices, 3 * ball.vertices, colors, weights, edges)
+    n = len(ball.vertices)
+    middle = ball.vertices[edges].mean(axis=1)
+    np.testing.assert_allclose(position[n:], middle, atol=1e-6)
+    far = np.linalg.norm(middle, axis=1) > 0.1
+    np.testing.assert_allclose(normals[n:][far], middle[far] / np.linalg.norm(middle[far], axis=1, keepdims=True),
+                               atol=1e-5)
+    assert (colors[n:] == (10, 20, 31, 255)).all() and (weights[n:] == weights[edges].min(axis=1)).all()
+    assert with_edges(ball.vertices, None, None, None, edges[:0])[1:] == (None, None, None)
+
+
+def test_both_sides_of_a_coarse_thin_rim_are_kept(device):
+    # A plate of 0.12 whose rim is round: a ball of 14 of its vertices holds both sides.
+    mesh = globe(16, 48)
+    thin = Mesh(mesh.vertices * np.float32([1, 1, 0.06]), mesh.faces)
+    surface = build_slim(thin, device=device)
+    camera = Camera.look_at((0.5, 3, 0.4), (0, 0, 0), fov=45)
+    wanted, got = (render(thing, camera, (160, 120), ("depth",), lod=0, device=device).depth
+                   for thing in (thin, surface))
+    assert (np.isfinite(got) & ~binary_dilation(np.isfinite(wanted), iterations=2)).sum() < 20
+    assert (~np.isfinite(got) & binary_erosion(np.isfinite(wanted), iterations=2)).sum() == 0

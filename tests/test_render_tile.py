@@ -9,6 +9,8 @@ from test_render_project import LANES, cameras, staged
 from clsurf.render.camera import Camera
 from clsurf.render.renderer import Renderer
 from clsurf.render.scene import Scene
+from clsurf.surface.slim import SlimSurface
+from clsurf.trace.hits import trace
 
 ALL = ("color", "depth", "normal", "position", "id", "count", "level", "cost")
 SIZE = (90, 70)
@@ -376,3 +378,26 @@ def test_lod_pictures_agree(device):
     inside = np.isfinite(fine.depth)
     assert (np.isfinite(coarse.depth) | ~inside).mean() > 0.995
     assert np.nanmedian(np.abs(fine.depth - coarse.depth)) < 5e-3
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+def test_a_flat_surfel_behind_leaves_no_hole(device, lanes):
+    # Its second root is 2 c / 0; the front point lies in its ball. The fandisk had 14 to 100 pixels of holes by it.
+    a, zero = np.radians(20), np.zeros((2, 6), np.float32)
+    turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    surface = SlimSurface(degree=2, error=0.01, centers=np.array([[0, 0, 0], [0, 0, -0.9]]) @ turn.T,
+                          radii=np.ones(2, np.float32), normals=np.array([[0, 0, 1], [0, 0, -1]]) @ turn.T,
+                          coefficients=zero, level=np.ones(2, np.int32), leaf=np.ones(2, bool),
+                          child_offset=np.zeros(3, np.int32), children=np.zeros(0, np.int32),
+                          fit_error=np.zeros(2, np.float32))
+    camera = Camera.look_at((0.3, 0.2, 6), (0, 0, 0), fov=30)
+    with Renderer(device, lanes=lanes) as renderer:
+        frame = renderer.render(surface, camera, (96, 96), ("depth", "position"), lod=0)
+    origins, directions = camera.rays((96, 96))
+    normal = turn[:, 2]
+    t = -(origins @ normal) / (directions @ normal)
+    inside = np.linalg.norm(origins + t[:, None] * directions, axis=1).reshape(96, 96) < 0.5  # enough support
+    off = np.einsum("ijk,k->ij", frame.position + frame.origin, normal)[inside]
+    assert inside.sum() > 400 and np.abs(off).max() < 1e-5
+    hits = trace(surface, origins[inside.ravel()], directions[inside.ravel()], device=device)
+    np.testing.assert_allclose(hits.distance, t[inside.ravel()], atol=1e-5)

@@ -22,7 +22,7 @@ from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
 from ..surface.slim import COEFFICIENTS
-from .large_faces import large_faces, with_middles
+from .large_faces import coarse_edges, large_faces, with_edges, with_middles
 from .point_tree import build_point_tree
 from .radius import LEAST_PENALTY, automatic_error, measure_noise, robust_box
 from .slim_levels import Points, assemble, build_levels, with_bound
@@ -187,7 +187,7 @@ class Reporter:
 def usable_points(scan, weight, device) -> Points:
     """Return the points of `scan` that are finite and have a normal and a weight, with what belongs to them.
 
-    The middles of a mesh's large faces are points too.
+    The middles of a mesh's large faces, and of all edges of a coarse one, are points too.
     """
     weights = None
     if weight is not None:
@@ -198,9 +198,11 @@ def usable_points(scan, weight, device) -> Points:
     colors = vertex_colors(scan)
     if normals is None and isinstance(scan, Mesh) and len(scan.faces):
         normals = face_normals(position, scan.faces)
-    if isinstance(scan, Mesh):
-        position, normals, colors, weights = with_middles(position, normals, colors, weights,
-                                                          large_faces(position, scan.faces))
+    if isinstance(scan, Mesh) and len(scan.faces):
+        edges = coarse_edges(position, normals, scan.faces)
+        large = large_faces(position, scan.faces)
+        position, normals, colors, weights = with_edges(position, normals, colors, weights, edges)
+        position, normals, colors, weights = with_middles(position, normals, colors, weights, large)
     usable = np.ones(len(position), bool)
     if not np.isfinite(position).all():
         usable &= np.isfinite(position).all(axis=1)

@@ -120,9 +120,10 @@ def ray_root(degree, poly, side):
         if degree == 1:
             return -c / b, -side * b, -side * b > 0
         disc = b * b - 4 * a * c
-        s = 2 * c / (side * np.sqrt(np.maximum(disc, 0)) - b)
+        below = side * np.sqrt(np.maximum(disc, 0)) - b
+        s = 2 * c / below
         if degree == 2:
-            return s, np.sqrt(np.maximum(disc, 0)), disc >= 0
+            return s, np.sqrt(np.maximum(disc, 0)), (disc >= 0) & (below != 0)
         for _ in range(3):
             s = s - (c + s * (b + s * (a + s * e))) / (b + s * (2 * a + 3 * s * e))
         slope = -side * (b + s * (2 * a + 3 * s * e))
