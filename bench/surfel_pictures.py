@@ -2,13 +2,14 @@
 
 | name | what it shows |
 |---|---|
-| map_sizes | figure 8: the meteoroid, surfels up to 16 pixels wide, normal maps of 1 to 32 texels; none; finest level |
+| map_sizes | figure 8: the meteoroid, surfels of up to 16 pixels radius, maps of 1 to 32 texels; none; finest level |
 | equal_cost | discs with one normal as in QSplat, and SLIM surfels, that take as long as discs with maps |
 | models | bunny, dragon and a coloured scan where there are any |
 """
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from . import scenes, views
 
 SIZE = (640, 640)
 MAP_SIZES = (1, 2, 4, 8, 16, 32)
+RADIUS_PX = 16.0  # of figure 8's surfels, which nothing but their size divides
 FIGURES = ("map_sizes", "equal_cost", "models")
 LIGHTS = (clsurf.Light("directional", (2.0, 1.5, 0.6), (0.9, 0.9, 0.9)), clsurf.Light("headlight", color=(0.15,) * 3))
 
@@ -47,10 +49,11 @@ class Pictures:
     def map_sizes(self) -> dict:
         """Figure 8: what the size of the normal maps keeps of the relief."""
         found = {}
+        as_paper = clsurf.SurfelDrawing(2 * RADIUS_PX, relief=np.inf)
         for size in MAP_SIZES:
             surface = clsurf.build_surfels(self.rock, map_size=size, device=self.device)
-            found[f"map_sizes_{size:02d}"] = self.draw(surface)
-        found["map_sizes_none"] = self.draw(surface, surfels=clsurf.SurfelDrawing(maps=False))
+            found[f"map_sizes_{size:02d}"] = self.draw(surface, surfels=as_paper)
+        found["map_sizes_none"] = self.draw(surface, surfels=replace(as_paper, maps=False))
         found["map_sizes_finest"] = self.draw(surface, lod=0.0)
         return found
 

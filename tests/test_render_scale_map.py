@@ -121,6 +121,19 @@ def test_tile_cells(renderers, camera):
         assert np.quantile(np.abs(frame.depth - seen * across)[both], 0.95) < 0.06
 
 
+def test_walls_along_the_rays_show_the_map_itself(renderers):
+    """Where cells stand as steep as a wall, its triangles are seen in other cells than the map: as its own rays do."""
+    surface = twin.smooth_map(24, f=lambda d: 0.5 + 0.5 * (d @ (0.7, -0.6, -0.5) > 0.1))
+    camera, size = cameras()[0], (160, 120)
+    hits = clsurf.trace(surface, *camera.rays(size), device=renderers[0].device)
+    depth = (hits.distance * (camera.rays(size)[1] @ -camera.rotation[2])).reshape(size[::-1])
+    for renderer in renderers[:2]:
+        got = renderer.render(surface, camera, size, "depth").depth
+        both, off = np.isfinite(depth) & np.isfinite(got), np.abs(got - depth) > 1e-3
+        wall = both & (np.abs(np.linalg.norm(hits.position, axis=-1).reshape(both.shape) - 0.75) < 0.24)
+        assert wall.sum() > 1500 and off[wall].mean() < 0.05 and off[both & ~wall].mean() < 0.003
+
+
 @pytest.mark.parametrize("drawing", (CAST, SPHERE))
 def test_forms_tiles_and_lanes_draw_the_same(device, drawing):
     surface, camera = twin.smooth_map(24, f=bumpy), cameras()[0]

@@ -52,10 +52,11 @@ def test_select_surfels(lanes, device, ring):
         for lod, interior in ((4.0, 16.0), (3.0, 40.0), (0.0, 0.0), (30.0, 60.0)):
             size = (90, 70)
             floats = place_surfels(upload, None, camera, size, lod)
-            state = select_surfels(device, scratch, upload, device.upload(floats), interior).copy()
-            wanted = twin.select_surfels(ring, twin.View(ring, camera, size), lod, interior)
-            assert (state != wanted).sum() <= 2  # float32 at a threshold
-            states |= set(state.tolist())
+            for relief in (0.75, 3.0, np.inf):
+                state = select_surfels(device, scratch, upload, device.upload(floats), interior, relief).copy()
+                wanted = twin.select_surfels(ring, twin.View(ring, camera, size), lod, interior, relief)
+                assert (state != wanted).sum() <= 2  # float32 at a threshold
+                states |= set(state.tolist())
     assert states == {0, 1, 2}
 
 
@@ -295,7 +296,8 @@ def test_shadows_fall_on_and_from_surfels(device, renderers):
         assert (np.abs(dark.color - lit.color)[outer].max(axis=1) < 1e-3).mean() > 0.98
 
 
-@pytest.mark.parametrize("options", [dict(interior=-1), dict(interior=np.nan), dict(interior="a"), dict(maps=1)])
+@pytest.mark.parametrize("options", [dict(interior=-1), dict(interior=np.nan), dict(interior="a"), dict(maps=1),
+                                     dict(relief=-1), dict(relief=np.nan), dict(relief="a")])
 def test_wrong_options_are_refused(options):
     with pytest.raises(InputError, match="surfels"):
         SurfelDrawing(**options)

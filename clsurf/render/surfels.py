@@ -144,14 +144,15 @@ def place_surfels(upload: SurfelUpload, matrix: NDArray | None, camera, size, lo
 
 
 def select_surfels(device: Device, scratch: Scratch, upload: SurfelUpload, view: DeviceArray,
-                   interior: float) -> NDArray:
+                   interior: float, relief: float) -> NDArray:
     """Walk the hierarchy level by level; return what becomes of every surfel, (count,) uint8, on the host."""
     state = scratch.array("surfel_state", (upload.count,), np.uint8)
     device.write(state, upload.state)
     kernel = device.kernel("render/select_surfels.cl", constants={"VW": scratch.lanes})
     for begin, end in itertools.pairwise(upload.level_end.tolist()):
         items = -(-end // scratch.lanes) - begin // scratch.lanes
-        kernel((items,), (min(64, items),), view, upload.surfels, interior, begin, end, state)
+        kernel((items,), (min(64, items),), view, upload.surfels, interior, relief, begin, end,
+               state)
     return device.download(state, copy=False)
 
 
@@ -217,7 +218,7 @@ def draw_surfels(device: Device, scratch: Scratch, grid: Grid, upload: SurfelUpl
     interior, lod = (drawing.interior, min(look.lod, drawing.interior))
     floats = place_surfels(upload, matrix, camera, grid.size, lod)
     view = device.upload(grid.clip_into(floats))
-    state = select_surfels(device, scratch, upload, view, interior if lod > 0 else 0.0)
+    state = select_surfels(device, scratch, upload, view, interior if lod > 0 else 0.0, drawing.relief)
     drawn = np.flatnonzero(state == DRAWN).astype(np.int32)
     if upload.triangles is not None:
         below = np.flatnonzero(state == BY_TRIANGLES)

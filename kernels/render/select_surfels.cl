@@ -3,18 +3,15 @@
 // drawn at once, so that most of the surfels need no look of their own. Launched level by level, coarse to fine; one
 // work-item handles VW surfels. Twin: tests/reference/surfels.py, select_surfels.
 //
-// Inside, a surfel may be INTERIOR pixels wide; where the normals below it, as far as its cone tells, may turn from the
-// eye, only LOD pixels. A bumpy surfel seen at an angle shows its relief in the wrong place: that may be RELIEF pixels.
+// Inside, a surfel may be `interior` pixels wide; where the normals below it, as far as its cone tells, may turn from the
+// eye, only LOD pixels. A bumpy surfel seen at an angle shows its relief in the wrong place: that may be `relief` pixels.
 #include "common/surfel.clh"
 
 // Of cones, which are twice as wide as the normals' deviation (clsurf/build/surfel_tree.py, CONE). Texels trim outlines
 // (tile_surfels.cl), so that few surfels must: dragon 1024x1024 at 0.75 26.4 ms, at 0.35 24.5.
 #define RIM 0.35f
-#ifndef RELIEF
-#define RELIEF 0.75f
-#endif
 
-__kernel void select_surfels(__global const float *view, __global const float *surfels, float interior, int begin,
+__kernel void select_surfels(__global const float *view, __global const float *surfels, float interior, float relief, int begin,
                              int end, __global uchar *state) {
   int first = begin / VW * VW + get_global_id(0) * VW;
   if (first >= end) return;
@@ -54,7 +51,7 @@ __kernel void select_surfels(__global const float *view, __global const float *s
   VF most = SEL((VF)(interior), (VF)(view[LOD]), facing < RIM * spread);
   VF side2 = 1.0f - facing * facing;
   VF shift = scale * field[S_HEIGHT] * VSQRT(VMAX(side2, (VF)(0.0f)));
-  VI small = (2.0f * f * r <= most * d) & (f * shift <= RELIEF * d) & ((VI)(perspective ? 0 : TRUE_LANES) | (depth > r));
+  VI small = (2.0f * f * r <= most * d) & (f * shift <= relief * d) & ((VI)(perspective ? 0 : TRUE_LANES) | (depth > r));
   const int *is_small = (const int *)&small, *is_out = (const int *)&out;
   for (int i = from; i < to; i++) {
     int at = first + i;

@@ -8,7 +8,7 @@
 // test_tile_cells).
 #include "render/cells.clh"
 #include "common/planes.clh"
-#include "common/cube.clh"
+#include "render/scale_sample.clh"
 #include "common/clip.clh"
 
 #ifndef TILE_BINS

@@ -7,7 +7,7 @@ from clsurf.surface.surfel import decoded_normals
 
 FALL, FACING = 4.0, 1e-3  # kernels/build/normal_maps.cl
 SLAB, LEAN, EDGE, BACK, CORE = 0.3, 0.25, 0.02, 0.25, 0.85  # clsurf/render/surfels.py, kernels/render/*surfels.cl
-RIM_COSINE, RELIEF, RIM, TRIM = 0.4, 0.75, 0.35, 0.5
+RIM_COSINE, RIM, TRIM = 0.4, 0.35, 0.5
 
 
 def surfel_radii(positions, normals, neighbours, overlap):
@@ -108,7 +108,7 @@ class View:
         self.rays = np.stack([sx, sy, -one] if p.perspective else [none, none, -one], axis=1)
 
 
-def select_surfels(surface, view, lod, interior):
+def select_surfels(surface, view, lod, interior, relief=0.75):
     """State of every surfel: 2 is drawn, 1 looked into, 3 drawn by its triangles, 0 neither."""
     n = len(surface)
     state = np.ones(n, int)
@@ -130,7 +130,7 @@ def select_surfels(surface, view, lod, interior):
     spread = surface.spreads + slope * surface.radii / distance
     most = np.where(facing < RIM * spread, lod, interior)
     small = (2 * f * surface.radii <= most * d) & (f * surface.heights * np.sqrt(np.maximum(1 - facing**2, 0))
-                                                   <= RELIEF * d)
+                                                   <= relief * d)
     small &= (-p[:, 2] > surface.radii) if view.p.perspective else True
     for i in range(n):
         if not state[i]:
