@@ -17,6 +17,7 @@ from clsurf.render.shade import Light, Shading
 from clsurf.render.surfels import place_surfels, select_surfels, upload_surfels
 from clsurf.render.tiles import Scratch
 from clsurf.surface.cloud import PointCloud
+from clsurf.surface.surfel import SurfelHierarchy
 
 ALL = ("color", "depth", "normal", "position", "id", "count", "level", "cost")
 LANES = (16, 8, 4, 1)
@@ -58,6 +59,20 @@ def test_select_surfels(lanes, device, ring):
                 assert (state != wanted).sum() <= 2  # float32 at a threshold
                 states |= set(state.tolist())
     assert states == {0, 1, 2}
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_base_surfels_beside_inner_ones_are_found(lanes, device):
+    """Children of both kinds, of two roots of which one is a base surfel: all base surfels are drawn at lod 0."""
+    n, level, offset = 7, (1, 1, 2, 2, 2, 3, 3), (0, 3, 3, 5, 5, 5, 5, 5)
+    up, one = np.tile((0.0, 0, 1), (n, 1)), np.ones(n)
+    surface = SurfelHierarchy(np.arange(3 * n).reshape(n, 3) / 99, up, one, 3 * one, 0 * one, 0 * one, level, offset,
+                              (2, 3, 4, 5, 6), np.arange(n), one, np.tile((128, 128, 255, 255), (n, 1)))
+    camera, upload = Camera.look_at((0, 0, 9), (0, 0, 0)), upload_surfels(device, surface)
+    view = device.upload(place_surfels(upload, None, camera, (9, 9), 0.0))
+    state = select_surfels(device, Scratch(device, lanes), upload, view, 0.0, 0.75)
+    wanted = twin.select_surfels(surface, twin.View(surface, camera, (9, 9)), 0.0, 0.0)
+    assert state.tolist() == wanted.tolist() == [1, 2, 1, 2, 2, 2, 2]
 
 
 @pytest.mark.parametrize("lanes", LANES)
