@@ -60,14 +60,8 @@ def with_edges(position, normals, colors, weights, edges) -> tuple:
     if not len(edges):
         return position, normals, colors, weights
     with np.errstate(over="ignore", invalid="ignore"):
-        mean = normals[edges].sum(axis=1)
-        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), np.finfo(np.float32).tiny)
-    if colors is not None:
-        colors = np.concatenate([colors, np.round(colors[edges].mean(axis=1)).astype(colors.dtype)])
-    if weights is not None:
-        weights = np.concatenate([weights, weights[edges].min(axis=1)])
-    return (np.concatenate([position, position[edges].mean(axis=1, dtype=np.float32)]),
-            np.concatenate([normals, mean.astype(np.float32)]), colors, weights)
+        mean = unit(normals[edges].sum(axis=1))
+    return with_means(position, normals, colors, weights, edges, mean)
 
 
 def longest2(points: NDArray, faces: NDArray) -> NDArray:
@@ -87,15 +81,26 @@ def with_middles(position, normals, colors, weights, faces) -> tuple:
     """
     if not len(faces):
         return position, normals, colors, weights
-    corners = position[faces]
+    normal = None
     if normals is not None:
+        corners = position[faces]
         with np.errstate(over="ignore", invalid="ignore"):
-            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+            normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
             normal *= np.where((normals[faces].sum(axis=1) * normal).sum(axis=1, keepdims=True) < 0, -1, 1)
-        normals = np.concatenate([normals, normal.astype(np.float32)])
+    return with_means(position, normals, colors, weights, faces, normal)
+
+
+def unit(vectors: NDArray) -> NDArray:
+    """Return vectors (n, 3) over their length; 0 stays."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+
+
+def with_means(position, normals, colors, weights, rows, own) -> tuple:
+    """Return the arrays with the means of `rows` (k, m) of them at their end: those have the normals `own` (k, 3)."""
+    if normals is not None:
+        normals = np.concatenate([normals, own.astype(np.float32)])
     if colors is not None:
-        colors = np.concatenate([colors, np.round(colors[faces].mean(axis=1)).astype(colors.dtype)])
+        colors = np.concatenate([colors, np.round(colors[rows].mean(axis=1)).astype(colors.dtype)])
     if weights is not None:
-        weights = np.concatenate([weights, weights[faces].min(axis=1)])
-    return np.concatenate([position, corners.mean(axis=1)]), normals, colors, weights
+        weights = np.concatenate([weights, weights[rows].min(axis=1)])
+    return np.concatenate([position, position[rows].mean(axis=1, dtype=np.float32)]), normals, colors, weights

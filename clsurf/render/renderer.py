@@ -139,16 +139,9 @@ class Renderer:
             1 to 4: samples along each side of a pixel. The picture is drawn that much larger, so thresholds in pixels
             count samples; "color" is the mean, every other channel that of the sample at the pixel's centre, or, for 2
             and 4, of the nearest in depth of the four around it.
-        patches : PatchDrawing, optional
-            How spatial patches are drawn.
-        slim : SlimDrawing, optional
-            How SLIM surfaces are drawn.
-        surfels : SurfelDrawing, optional
-            How surfel hierarchies are drawn.
-        scale_map : ScaleMapDrawing, optional
-            How scale maps are drawn.
-        points : PointDrawing, optional
-            How point clouds and the points of range images are drawn.
+        patches, slim, surfels, scale_map, points : optional
+            A `PatchDrawing`, `SlimDrawing`, `SurfelDrawing`, `ScaleMapDrawing`, `PointDrawing`: how spatial patches,
+            SLIM surfaces, surfel hierarchies, scale maps, and clouds and the points of range images are drawn.
         clip : (4,) or (n, 4) array_like, optional
             Up to 8 planes a, b, c, d, world space: only what has a x + b y + c z + d >= 0 for all of them is drawn, so
             that the inside is seen. What is cut off still throws shadows and is seen in mirrors.

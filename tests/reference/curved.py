@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from clsurf.surface.cloud import PointCloud
+
 
 def lattice(n):
     """Return n points (s, t) of the unit square on a rank-1 lattice: even, and without rows."""
@@ -86,3 +88,17 @@ def plane(n, size=0.5):
     s, t = lattice(n)
     points = np.stack([(2 * s - 1) * size, (2 * t - 1) * size, 0 * s], axis=1)
     return points, np.tile((0.0, 0.0, 1.0), (n, 1)), np.zeros(n), np.zeros(n)
+
+
+def cloud_of(points, normals):
+    return PointCloud(points, np.asarray(normals, np.float32))
+
+
+def size_of(mean, gaussian):
+    """Root mean square of the larger principal curvature's kind, to measure errors by where H vanishes."""
+    return np.sqrt(np.mean(4 * mean**2 - 2 * gaussian)) or 1.0
+
+
+def rotation(seed=0):
+    q = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return q * np.sign(np.linalg.det(q))
