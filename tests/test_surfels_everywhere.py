@@ -100,6 +100,15 @@ def test_no_inside_is_seen_past_the_inner_part_of_a_disc(form, x, facing, wanted
         assert depth == pytest.approx(wanted, abs=1e-5) and z > 0.99
 
 
+def test_a_sheet_drawn_before_does_not_hide_what_a_gap_shows(form):
+    """The sheet lies between the disc that covers the gap and the disc seen from behind that the gap would show."""
+    gap, sheet = plates(10.0, 1.0, (1, -1), 0.5), plates(0.1, 3.0, (1, 1)).moved(np.diag([1.0, 1, 1, 1]) - [
+        [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 5], [0, 0, 0, 0]])
+    for first, second in ((sheet, gap), (gap, sheet)):
+        for depth, _ in list(seen_from_above([first, second], 0.9, form))[:2]:  # pictures
+            assert depth == pytest.approx(4.0, abs=1e-5)
+
+
 def test_rays_on_a_sphere(form, ball):
     origins, directions = random_rays(3000)
     b = (origins * directions).sum(axis=1)
