@@ -16,7 +16,6 @@ from .ray_triangles import mesh_colors, trace_triangles
 from .tree import WIDTH, node_boxes, plant
 
 MARGIN = 1e-6  # of boxes, frame units: more than the kernel's rounding, as coordinates are at most 1 or so
-SLAB, LEAN = 0.3, 0.25  # kernels/trace/ray_surfels.cl
 
 
 @register(SurfelHierarchy)
@@ -45,12 +44,11 @@ def trace_surfels(device: Device, surface: SurfelHierarchy) -> Traced:
     blocks = tree.in_slots(fields, 0).reshape(-1, WIDTH, 7).transpose(0, 2, 1)  # empty slots have no radius
     arrays = [device.upload(node_boxes(tree, centers - reach, centers + reach)),
               device.upload(np.ascontiguousarray(blocks)), device.upload(tree.in_slots(base.astype(np.int32), -1))]
-    slack = float(1.01 * SLAB / LEAN * own.max())
 
     def launch(mode, count, rays, hits):
         size, group, batch = items(device, count)
         device.kernel("trace/ray_surfels.cl", constants={"VW": device.lanes, "MODE": mode})(
-            size, group, count, batch, tree.roots, tree.first_bottom, slack, *arrays, rays, hits)
+            size, group, count, batch, tree.roots, tree.first_bottom, float(own.max()), *arrays, rays, hits)
 
     half = (high - low) / 2 / unit + 1e-3
     colors = surface.colors
