@@ -57,6 +57,8 @@ class Device:
     memory_bytes, largest_buffer_bytes, local_bytes : int
     lanes : int
         Default kernel form: vector lanes of one work-item (16, 8 or 4), or 1 for a work-group per tile.
+    loop_turns : int or None
+        After so many turns of a work-item's loops, all loops together, the driver ends them (llvmpipe); None: never.
     group_items : int
         Items that run side by side: those of a launch without groups of its own are put together by so many.
     profile : Profile or None
@@ -73,6 +75,8 @@ class Device:
         self.memory_bytes, self.largest_buffer_bytes = cl_device.global_mem_size, cl_device.max_mem_alloc_size
         self.local_bytes = cl_device.local_mem_size
         self.lanes = 16 if self.kind == "cpu" and not any(word in self.name.lower() for word in SINGLE) else 1
+        # LP_MAX_TGSI_LOOP_ITERATIONS in Mesa: no error, the kernel goes on behind each loop.
+        self.loop_turns = 65535 if "llvmpipe" in self.name.lower() else None
         # llvmpipe runs 8 as lanes (58 balls of fit_surfels: 0.15 s, 1.4 one by one); where lanes are 16, one is enough.
         self.group_items = 1 if self.lanes > 1 else 8 if self.kind == "cpu" else 64
         self.profile: Profile | None = None
