@@ -89,7 +89,8 @@ def test_drivers_that_end_long_loops_get_trees_too(device, count, monkeypatch):
 
 
 @pytest.mark.parametrize("count", [300, 1500, 5000])
-def test_split_nodes(device, count):
+def test_split_nodes(device, count, monkeypatch):
+    monkeypatch.setattr(device, "loop_turns", None)  # all rounds on the device
     low, high = (np.round(1024 * side) / 1024 for side in boxes(count, seed=count))
     low[:, 0], high[:, 0] = low[:, 0] + 0.01 * np.arange(count), high[:, 0] + 0.01 * np.arange(count)  # no equal keys
     tree = plant(device, low, high)
