@@ -18,6 +18,7 @@ from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
+from ..trace.pieces import forget
 from .average import average
 from .backdrop import around, lay_over
 from .bands import draw_in_bands
@@ -229,7 +230,8 @@ class Renderer:
         if asked.covered:
             self._cover(grid, scene, camera, look, whole, floats, lighting, arrays)
         if asked.mirrored:
-            reflect(self.device, scene, camera, shading, around(asked.back, scene), origin, floats, lighting, arrays)
+            self._with_room(reflect, self.device, scene, camera, shading, around(asked.back, scene), origin, floats,
+                            lighting, arrays)
         if asked.factor > 1:
             arrays = average(self.device, arrays, picture, asked.factor, asked.kept, asked.curved,
                              self._scratch.lanes)
@@ -267,7 +269,17 @@ class Renderer:
         if grid.layout.unlit and look.points.eye_dome is not False:
             eye_dome(self.device, self._scratch, grid, look.points, camera, factor)
         if lighting is not None:
-            light_grid(self.device, self._scratch, grid, scene, camera, look.shading, floats, look.lamps, lighting)
+            self._with_room(light_grid, self.device, self._scratch, grid, scene, camera, look.shading, floats,
+                            look.lamps, lighting)
+
+    def _with_room(self, stage, *arguments) -> None:
+        """Run a stage whose rays need surfaces on the device; where that lacks memory, without what drew them."""
+        try:
+            return stage(*arguments)
+        except DeviceMemoryError:
+            self._uploads.clear()
+        forget(self.device)
+        return stage(*arguments)
 
     def _cut(self, scene) -> bool:
         """Cut patches that are drawn without planes; return whether anything was."""
