@@ -71,40 +71,43 @@ def fresh_mask(device: Device, scratch: Scratch, casters: Casters, name: str, bi
 
 
 def cast(device: Device, scratch: Scratch, grid: Grid, casters: Casters, lamps: NDArray, reach: float,
-         mask: DeviceArray, words: int, word: int) -> None:
-    """Fill word `word` of the mask (bins, words, 64) uint32 with the lamps that are hidden by any of the casters.
+         mask: DeviceArray) -> None:
+    """Fill the mask (bins, words, 64) uint32 with the lamps that are hidden by any of the casters, 32 a word.
 
     Without packets, what is in the mask stays (`fresh_mask`).
 
     Parameters
     ----------
     lamps : (n, 8) float32
-        At most 32: kind (0: at the eye, 1: directional, 2: point), then the direction to it or its place, view space.
+        Kind (0: at the eye, 1: directional, 2: point), then the direction to it or its place, view space.
     reach : float
         World units: what lies farther than this before a point does not count; inf: everything counts.
     """
     if not len(lamps):
         return
-    on_device = device.upload(np.ascontiguousarray(lamps, np.float32))
+    parts = [lamps[first:first + 32] for first in range(0, len(lamps), 32)]
+    parts = [(part, device.upload(np.ascontiguousarray(part, np.float32))) for part in parts]
+    stride = 64 * mask.shape[1]
     for i, caster in enumerate(casters.packets):
         fresh = i == 0 and caster.held.whole is not None
 
         def hide(traced, _, caster=caster, fresh=fresh):
             view = device.upload(occluder_view(traced.packets.origin, caster.matrix, casters.camera, grid.size))
-            trace_lights(device, packet_lanes(scratch.lanes), traced.packets, view, grid.layout.constants, on_device,
-                         len(lamps), reach, fresh, grid.bins_x, grid.bins_y, grid.touched, grid.planes, mask,
-                         64 * words, 64 * word)
+            for word, (part, on_device) in enumerate(parts):
+                trace_lights(device, packet_lanes(scratch.lanes), traced.packets, view, grid.layout.constants,
+                             on_device, len(part), reach, fresh, grid.bins_x, grid.bins_y, grid.touched, grid.planes,
+                             mask, stride, 64 * word)
 
         caster.held.each(hide, rays=False)
     if casters.pixels.shape[0]:
         for caster in casters.singles:
-            cast_singly(device, scratch, grid, casters, caster, lamps, on_device, reach, mask, words, word)
+            cast_singly(device, scratch, grid, casters, caster, parts, reach, mask)
 
 
-def cast_singly(device: Device, scratch: Scratch, grid: Grid, casters: Casters, caster: Caster, lamps: NDArray,
-                on_device: DeviceArray, reach: float, mask: DeviceArray, words: int, word: int) -> None:
-    """Do `cast` for one caster by single rays; `on_device`: the lamps."""
-    count = casters.pixels.shape[0]
+def cast_singly(device: Device, scratch: Scratch, grid: Grid, casters: Casters, caster: Caster, parts: list,
+                reach: float, mask: DeviceArray) -> None:
+    """Do `cast` for one caster by single rays; `parts`: the lamps of each word, here and on the device."""
+    count, stride = casters.pixels.shape[0], 64 * mask.shape[1]
     chunk = min(count, CHUNK, max(device.largest_buffer_bytes // (4 * RAY_FLOATS), 64))
     rays = scratch.array("lamp_rays", (chunk, RAY_FLOATS), np.float32)
     hits = scratch.array("lamp_hits", (chunk, HIT_FLOATS), np.float32)
@@ -114,12 +117,13 @@ def cast_singly(device: Device, scratch: Scratch, grid: Grid, casters: Casters, 
     def hide(traced, _):
         place = device.upload(view_placement(traced, caster.matrix, casters.camera))
         for first in range(0, count, chunk):
-            part = min(chunk, count - first)
-            for lamp in np.flatnonzero(lamps[:, 0] != HEADLIGHT):
-                make((part,), (64,), part, first, casters.pixels, casters.view, place, on_device, lamp, caster.step,
-                     reach, grid.bins_x, grid.planes, mask, 64 * words, 64 * word, rays)
-                traced.launch(ANY, part, rays, hits)
-                take((part,), (64,), part, first, casters.pixels, hits, lamp, mask, 64 * words, 64 * word)
+            some = min(chunk, count - first)
+            for word, (lamps, on_device) in enumerate(parts):
+                for lamp in np.flatnonzero(lamps[:, 0] != HEADLIGHT):
+                    make((some,), (64,), some, first, casters.pixels, casters.view, place, on_device, lamp, caster.step,
+                         reach, grid.bins_x, grid.planes, mask, stride, 64 * word, rays)
+                    traced.launch(ANY, some, rays, hits)
+                    take((some,), (64,), some, first, casters.pixels, hits, lamp, mask, stride, 64 * word)
 
     caster.held.each(hide)
 
