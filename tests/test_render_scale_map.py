@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from conftest import scan_path
 from reference import scale_map as twin
-from reference.small_device import small
 from reference.trace_rays import ray_triangles, unit
 
 import clsurf
@@ -397,24 +396,3 @@ def test_bunny_against_its_mesh(device):
     depth = (hits.distance * (camera.rays((120, 90))[1] @ -camera.rotation[2])).reshape(90, 120)
     both = np.isfinite(depth) & np.isfinite(frame.depth)
     assert both.sum() > 2500 and np.median(np.abs(frame.depth - depth)[both]) < 2e-3 * surface.radius
-
-
-@pytest.mark.parametrize("lanes", (16, 1))
-@pytest.mark.parametrize("drawing", (CAST, ScaleMapDrawing("geosphere", 5)))
-def test_maps_larger_than_a_device_are_drawn_in_parts(device, lanes, drawing):
-    """Blocks, and layers, one after the other, to the picture of the whole."""
-    base = twin.smooth_map(48, f=bumpy)
-    scales = np.concatenate([base.scales, base.scales // 2])
-    surface = ScaleMap(base.center, base.radius, scales, np.concatenate([base.valid] * 2))
-    camera, channels = Camera.framing(surface, direction=(0.4, -0.6, 1)), ("color", "depth", "normal", "id", "level")
-    with Renderer(device, lanes=lanes) as renderer:
-        wanted = renderer.render(surface, camera, SIZE, channels, scale_map=drawing)
-    again = ScaleMap(base.center, base.radius, scales, surface.valid)
-    with small(device, 400_000) as used, Renderer(device, lanes=lanes) as renderer:
-        for _ in range(2):
-            got = renderer.render(again, camera, SIZE, channels, scale_map=drawing)
-            for name in channels:
-                # Where a ray meets the edge of a block, the first one drawn is seen.
-                np.testing.assert_allclose(got.channels[name], wanted.channels[name], atol=1e-3, err_msg=name)
-                assert (got.channels[name] != wanted.channels[name])[wanted.id >= 0].mean() < 0.01
-    assert used["most"] > 400_000
