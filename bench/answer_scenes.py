@@ -17,9 +17,11 @@ class Size:
     picture: tuple[int, int]
     rays: int
     lit: tuple[int, int] = (480, 360)  # pictures with traced light, whose pixels cost ten times as much
+    occlusion: int = 32  # directions
+    sky_cells: int | None = None  # along a side of the maps of image lights; None: as always
 
 
-SIZES = {"tiny": Size(300, (40, 32), 40, (20, 16)), "small": Size(20_000, (480, 360), 20_000)}
+SIZES = {"tiny": Size(300, (40, 32), 40, (20, 16), 8, 8), "small": Size(20_000, (480, 360), 20_000)}
 
 
 def scans(size: Size) -> dict:

@@ -8,12 +8,15 @@ of its own, which is how the job `devices` and the memory checks under Oclgrind 
 import argparse
 import hashlib
 from collections.abc import Callable
+from contextlib import nullcontext
+from unittest import mock
 
 import numpy as np
 
 import clsurf
 from clsurf.build.point_tree import build_point_tree
 from clsurf.build.stream_cells import covered_by, records_of
+from clsurf.render import sky
 from clsurf.surface.mesh import Mesh
 from clsurf.view.picture import to_bytes
 
@@ -164,17 +167,25 @@ def materials(device, size, made):
     scene = clsurf.Scene([made[name].moved(raised(0.6 * i)) for i, name in enumerate(names)], lights=lamps,
                          materials=looks)
     for lanes in forms(device):
-        with clsurf.Renderer(device, lanes=lanes) as renderer:
+        with clsurf.Renderer(device, lanes=lanes) as renderer, of_few_cells(size):
             out[f"color_{lanes}"] = renderer.render(scene, camera(size), size.lit, ("color",), background="sky",
-                                                    shading=clsurf.Shading(occlusion=32)).color
+                                                    shading=clsurf.Shading(occlusion=size.occlusion)).color
     return out
+
+
+def of_few_cells(size: Size):
+    """Return a context in which image lights have maps of few cells, where the size says so."""
+    if size.sky_cells is None:
+        return nullcontext()
+    return mock.patch.multiple(sky, MIRROR_CELLS=(size.sky_cells,) * len(sky.MIRROR_CELLS), MATTE_CELLS=size.sky_cells,
+                               LAST_LEVEL=7)
 
 
 @job
 def light(device, size, made):
     """Shadows, ambient occlusion and a mirror, in both kernel forms."""
     lamps = (clsurf.Light("directional", (1, 1, 2)), clsurf.Light("point", (2.0, -2.0, 3.0)))
-    shading = clsurf.Shading(shadows=True, occlusion=32, mirror=0.3)
+    shading = clsurf.Shading(shadows=True, occlusion=size.occlusion, mirror=0.3)
     scene = clsurf.Scene([made["slim2"], made["patches"].moved(raised(0.7))], lights=lamps)
     out = {}
     for lanes in forms(device):

@@ -260,7 +260,7 @@ class Reader:
     """A process that loads files by name."""
 
     def __init__(self):
-        self.process = None
+        self.process, self._answers = None, b""
 
     def start(self) -> None:
         """Start the process anew."""
@@ -277,12 +277,23 @@ class Reader:
             self.process.wait()
             self.process.stdin.close()
             self.process.stdout.close()
-            self.process = None
+            self.process, self._answers = None, b""
 
     def _line(self, seconds: float) -> str | None:
-        if not select.select([self.process.stdout], [], [], seconds)[0]:
-            return None
-        return self.process.stdout.readline().decode(errors="replace")
+        """Return the next line, "" at the end; None where there is none for so long.
+
+        Several may come at once: with those in a buffer of the stream's own, `select` would wait for more.
+        """
+        pipe = self.process.stdout.fileno()
+        while b"\n" not in self._answers:
+            if not select.select([pipe], [], [], seconds)[0]:
+                return None
+            got = os.read(pipe, 1 << 16)
+            if not got:
+                return ""
+            self._answers += got
+        line, self._answers = self._answers.split(b"\n", 1)
+        return line.decode(errors="replace")
 
     def read(self, path: Path, how: str = "load") -> tuple[str, float, int]:
         """Return what became of a file, the seconds, and the bytes of memory beyond those before."""

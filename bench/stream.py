@@ -17,7 +17,8 @@ from . import scenes
 from .build import WrongAnswer
 from .table import print_table
 
-TOLERANCE = 0.3  # metres, of autzen: a quarter of its point spacing
+# Of autzen, whose unit is the foot (its file does not say so): a quarter of the point spacing, and 0.3 m.
+TOLERANCES = {"autzen": 0.3, "autzen, 0.3 m": 0.3 / 0.3048}
 SAMPLE = 50  # every so many of the points is measured
 GENERATED = (10_000_000, 50_000_000)
 QUICK = (200_000, 1_000_000)
@@ -46,11 +47,13 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
     with tempfile.TemporaryDirectory(prefix="clsurf-bench-") as folder:
         autzen = scenes.data_folder() / "clouds" / "autzen.laz"
         if not quick and autzen.exists():
-            figures["autzen"] = _built(autzen, Path(folder), selector, TOLERANCE)
-            figures["autzen"]["within"] = _within(autzen, Path(folder) / "surface.clsurf", device)
-            if not figures["autzen"]["within"] > 0.99:
-                raise WrongAnswer(f"bench stream: expected 99 % of autzen's points within {TOLERANCE}, got "
-                                  f"{figures['autzen']['within']:.2%}")
+            for name, tolerance in TOLERANCES.items():
+                one = figures[name] = _built(autzen, Path(folder), selector, tolerance)
+                one["tolerance"] = tolerance
+                one["within"] = _within(autzen, Path(folder) / "surface.clsurf", tolerance, device)
+                if not one["within"] > 0.99:
+                    raise WrongAnswer(f"bench stream: expected 99 % of autzen's points within {tolerance:.3g}, got "
+                                      f"{one['within']:.2%}")
         elif not quick:
             print("scan missing: autzen (CLSURF_DATA names the folder)")
         for count in QUICK if quick else GENERATED:
@@ -64,13 +67,19 @@ def measure(device, quick: bool = False, profile: bool = False) -> dict:
     return figures
 
 
+def _error(one: dict) -> str:
+    if "within" in one:
+        return f"{one['within']:.2%} within {one['tolerance']:.3g}"
+    return f"{one['bound']:.3g} bound"
+
+
 def show(figures: dict) -> None:
     """Print the figures."""
     rows = [(name, f"{one['points']:,}", f"{one['seconds']:.1f}", f"{one['cpu_seconds']:.1f}",
              f"{one['peak_bytes'] / 1e6:.0f}",
-             f"{one['surfels']:,}", f"{one['within']:.2%}" if "within" in one else f"{one['bound']:.3g} bound")
+             f"{one['surfels']:,}", _error(one))
             for name, one in figures.items() if isinstance(one, dict)]
-    print_table(("scan", "points", "s", "CPU s", "peak MB", "surfels", f"within {TOLERANCE} m"), rows)
+    print_table(("scan", "points", "s", "CPU s", "peak MB", "surfels", "error"), rows)
     print(f"time a point, largest over smallest: {figures['linear']:.2f}, of all cores {figures['linear_cpu']:.2f}")
 
 
@@ -106,9 +115,9 @@ def _built(path: Path, folder: Path, selector: str, tolerance) -> dict:
             "parts": len(stored.surfels), **json.loads(done.stdout.splitlines()[-1])}
 
 
-def _within(path: Path, place: Path, device) -> float:
-    """Return the share of every SAMPLE-th point of a scan that the surface comes within TOLERANCE of."""
+def _within(path: Path, place: Path, tolerance: float, device) -> float:
+    """Return the share of every SAMPLE-th point of a scan that the surface comes within `tolerance` of."""
     surface, source = StoredSurface(place).load(), open_source(path)
-    near = [np.abs(project(surface, source.read(k).points[::SAMPLE], device).distance) <= TOLERANCE
+    near = [np.abs(project(surface, source.read(k).points[::SAMPLE], device).distance) <= tolerance
             for k in range(source.chunks)]
     return float(np.concatenate(near).mean())

@@ -8,6 +8,7 @@ import pytest
 from bench.answer_scenes import forms
 from clsurf.device import open_device
 from clsurf.render.renderer import Renderer
+from clsurf.render.tiles import Scratch
 
 _without_data: list[str] = []
 
@@ -27,14 +28,30 @@ def device():
 
 def pytest_collection_modifyitems(config, items):
     """On a device of single items, kernels of several lanes are left out: nobody gets them there (clsurf/device)."""
-    if not any(hasattr(item, "callspec") and "lanes" in item.callspec.params for item in items):
+    asked = [(item, item.callspec.params.get(name)) for item in items if hasattr(item, "callspec")
+             for name in ("lanes", "form", "either_form")]
+    wide = {item: lanes for item, lanes in asked if lanes in (4, 8, 16)}
+    if not wide:
         return
     most = max(forms(open_device(os.environ.get("CLSURF_DEVICE") or "pocl")))
-    left_out = [item for item in items if hasattr(item, "callspec") and item.callspec.params.get("lanes") in (4, 8, 16)
-                and item.callspec.params["lanes"] > most]
+    left_out = [item for item, lanes in wide.items() if lanes > most]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in left_out]
+        items[:] = [item for item in items if item not in set(left_out)]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_wider_pictures():
+    """On such a device tests that draw in several forms draw in its own each time."""
+    if "CLSURF_DEVICE" not in os.environ or (most := max(forms(open_device(os.environ["CLSURF_DEVICE"])))) == 16:
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (Renderer, Scratch):
+            def narrowed(self, device=None, lanes=None, *rest, made=kind.__init__, **options):
+                made(self, device, lanes and min(lanes, most), *rest, **options)
+            patch.setattr(kind, "__init__", narrowed)
+        yield
 
 
 @pytest.fixture(params=[16, 8, 4, 1])

@@ -58,3 +58,15 @@ def test_a_reader_that_fails_is_seen(tmp_path, monkeypatch, text, word):
     finally:
         reader.stop()
     assert memory > 1 << 27 if word == "memory" else got == word
+
+
+def test_answers_that_come_at_once_are_no_hang(monkeypatch, tmp_path):
+    monkeypatch.setattr(fuzz, "READER", 'import sys, time\nprint("ready", flush=True)\n'
+                        'asked = [sys.stdin.readline() for _ in range(3)]\n'
+                        'print("read 0 0\\nrefused 1 2\\nread 0 0", flush=True)\ntime.sleep(99)')
+    monkeypatch.setattr(fuzz, "SECONDS", 0.5)
+    reader = fuzz.Reader()
+    try:
+        assert reader.read_all([tmp_path] * 3) == [("read", 0.0, 0), ("refused", 1.0, 2), ("read", 0.0, 0)]
+    finally:
+        reader.stop()

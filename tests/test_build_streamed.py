@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion, binary_fill_holes
 from scipy.spatial import cKDTree
 
 import clsurf
-from clsurf.build import stream_plan, stream_runs, streamed
+from clsurf.build import stream_here, stream_plan, stream_runs, streamed
 from clsurf.errors import Cancelled, InputError
 from clsurf.io.chunks import open_source
 
@@ -178,6 +178,34 @@ def test_resumed_build_has_equal_bytes(hills, whole, device, tmp_path, stage, ti
     assert tree_bytes(whole.place) == tree_bytes(again)
 
 
+def test_bytes_do_not_depend_on_how_many_cells_are_built_at_once(hills, whole, device, tmp_path, monkeypatch):
+    assert stream_here.AT_ONCE > 1
+    monkeypatch.setattr(stream_here, "AT_ONCE", 1)
+    alone = clsurf.build_slim(hills, error=0.002, out=tmp_path / "a.clsurf", device=device)
+    assert tree_bytes(whole.place) == tree_bytes(alone.place)
+
+
+def test_a_cell_that_fails_stops_the_build_and_leaves_the_others(hills, whole, device, tmp_path, monkeypatch):
+    build_cell, calls = streamed.build_cell, []
+
+    def failing(*arguments):
+        calls.append(1)
+        if len(calls) == 3:
+            raise InputError("third: expected to fail, did")
+        return build_cell(*arguments)
+    monkeypatch.setattr(streamed, "build_cell", failing)
+    again = tmp_path / "again.clsurf"
+    with pytest.raises(InputError, match="third"):
+        clsurf.build_slim(hills, error=0.002, out=again, device=device)
+    begun = len(calls)
+    assert begun <= 3 + stream_here.AT_ONCE  # the rest is not begun
+    made = len(list((tmp_path / "again.clsurf.part" / "parts").glob("0*"))) - 1
+    assert begun - 2 <= made <= begun - 1
+    monkeypatch.setattr(streamed, "build_cell", build_cell)
+    clsurf.build_slim(hills, error=0.002, out=again, device=device)
+    assert tree_bytes(whole.place) == tree_bytes(again)
+
+
 KILLED = """
 import sys
 from pathlib import Path
@@ -327,11 +355,11 @@ def test_command_line(hills, device, tmp_path, capsys, monkeypatch):
     name = "intel" if "intel" in device.platform_name.lower() else "pocl"
     out = tmp_path / "a.clsurf"
     arguments = ["build", str(hills), str(out), "--memory", "1GB", "--error", "0.002", "--device", name]
-    cell = streamed.Build.cell
-    monkeypatch.setattr(streamed.Build, "cell", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    build_cell = streamed.build_cell
+    monkeypatch.setattr(streamed, "build_cell", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
     assert main(arguments) == 130
     assert "a.clsurf.part keeps what is done" in capsys.readouterr().err and not out.exists()
-    monkeypatch.setattr(streamed.Build, "cell", cell)
+    monkeypatch.setattr(streamed, "build_cell", build_cell)
     assert main(arguments) == 0 and out.is_dir() and not (tmp_path / "a.clsurf.part").exists()
     assert "surfels in" in capsys.readouterr().err
     assert main(["info", str(out)]) == 0

@@ -11,6 +11,7 @@ from test_io_scans import MESH_FORMATS, make_cloud, make_mesh
 
 from clsurf.errors import FileFormatError, InputError
 from clsurf.io import load, save
+from clsurf.io.las import opened
 from clsurf.io.scans import READS, load_scan, save_scan
 
 
@@ -149,3 +150,19 @@ def test_las_counts_are_checked_first(tmp_path, at, value):
     start = time.perf_counter()
     load_scan_fails(path)
     assert time.perf_counter() - start < 20  # only a hang takes that long
+
+
+@pytest.mark.parametrize("points", (50_000, 2**32 - 70_000))
+def test_laz_chunks_may_say_more_points_than_the_file_has(tmp_path, points):
+    """The decoder that takes memory for whole chunks ended the process."""
+    path, cloud = tmp_path / "a.laz", make_cloud()
+    save(cloud, path)
+    data = bytearray(path.read_bytes())
+    at = data.index(struct.pack("<I", 50_000), data.index(b"laszip encoded"))
+    data[at:at + 4] = points.to_bytes(4, "little")
+    path.write_bytes(data)
+    save(cloud, tmp_path / "b.laz")
+    assert (load_scan(path).points == load_scan(tmp_path / "b.laz").points).all()
+    with opened(path) as reader:
+        reader.seek(len(cloud.points) // 2)
+        assert len(reader.read_points(3)) == 3

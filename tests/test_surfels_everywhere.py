@@ -105,8 +105,26 @@ def test_a_sheet_drawn_before_does_not_hide_what_a_gap_shows(form):
     gap, sheet = plates(10.0, 1.0, (1, -1), 0.5), plates(0.1, 3.0, (1, 1)).moved(np.diag([1.0, 1, 1, 1]) - [
         [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 5], [0, 0, 0, 0]])
     for first, second in ((sheet, gap), (gap, sheet)):
-        for depth, _ in list(seen_from_above([first, second], 0.9, form))[:2]:  # pictures
+        for depth, _ in seen_from_above([first, second], 0.9, form):
             assert depth == pytest.approx(4.0, abs=1e-5)
+        assert trace([first, second], (0.9, 0, 4), (0, 0, -1), "any", far=4.5, device=form).hit
+
+
+@pytest.mark.parametrize("query", ("closest", "all"))
+def test_a_rays_end_cuts_off_hits_alone(form, ring, query):
+    """Wherever rays end, their hits before that are those of endless ones: no disc behind the end shows in a hit."""
+    origins, directions = random_rays(200)
+    every = trace(ring, origins, directions, query, device=form)
+    ray = np.arange(200) if query == "closest" else np.repeat(np.arange(200), np.diff(every.offsets))
+    ray, distance = ray[np.isfinite(every.distance)], every.distance[np.isfinite(every.distance)]
+    for past in (-0.1, -0.01, -1e-4, 1e-4, 0.01, 0.1):
+        far = distance + past  # one ray for each hit
+        ended = trace(ring, origins[ray], directions[ray], query, far=far, device=form)
+        number = np.arange(len(ray)) if query == "closest" else np.repeat(np.arange(len(ray)), np.diff(ended.offsets))
+        of, wanted = np.nonzero((ray[:, None] == ray) & (distance <= far[:, None]))
+        assert len(of) > 0 or (past < 0 and query == "closest")
+        np.testing.assert_array_equal(number[np.isfinite(ended.distance)], of)
+        np.testing.assert_allclose(ended.distance[np.isfinite(ended.distance)], distance[wanted], atol=1e-6)
 
 
 def test_rays_on_a_sphere(form, ball):

@@ -4,6 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
+from conftest import scan_path
 from reference.ray_scenes import torus_mesh
 from reference.small_device import small
 from reference.surfaces import leaves
@@ -132,6 +133,19 @@ def test_hits_without_support_are_looked_behind_across_parts(device, monkeypatch
     np.testing.assert_allclose(got["closest"].distance, wanted["closest"].distance, atol=1e-5)
     np.testing.assert_array_equal(got["all"].offsets, wanted["all"].offsets)
     np.testing.assert_allclose(got["all"].distance, wanted["all"].distance, atol=1e-5)
+
+
+def test_gaps_between_discs_are_closed_across_parts(device):
+    """A rim counts where what is behind it is seen from behind, whichever part that is in: 44 rays of the bunny."""
+    thing = clsurf.build_surfels(clsurf.load(scan_path("bunny/bunny.obj")), device=device)
+    rays, size = rays_at(thing, 200_000), np.linalg.norm(np.ptp(thing.bounds, axis=0))
+    wanted = clsurf.trace(thing, *rays, device=device)
+    with small(device, 400_000):
+        thing = fresh(thing)
+        got = clsurf.trace(thing, *rays, device=device)
+        assert parts(device, thing, True) >= 3
+    np.testing.assert_array_equal(got.hit, wanted.hit)
+    assert (np.abs(got.distance - wanted.distance)[got.hit] > 1e-5 * size).sum() <= 2
 
 
 def test_what_cannot_be_cut_is_told(things, device):

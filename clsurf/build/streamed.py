@@ -9,7 +9,8 @@ import json
 import logging
 import os
 import shutil
-from dataclasses import asdict, astuple
+import threading
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,6 @@ from .patches import PatchRequest
 from .radius import Noise, automatic_error
 from .slim_levels import BOUND_SHARE, LEVELS, ROUNDING
 from .stream_cells import (
-    CellPoints,
     Coarse,
     Options,
     build_cell,
@@ -63,10 +63,7 @@ class Build:
         job = json.loads((self.folder / "job.json").read_bytes())
         self.sizes, self.options = Sizes(**job["sizes"]), Options(**job["options"])
         self.source_path = Path(job["source"]["path"])
-        self._runs: Runs | None = None
-        self._coarse: Coarse | None = None
-        self._checked: Coarse | None = None
-        self._plan: Plan | None = None
+        self._lock, self._read = threading.RLock(), {}  # what the steps share is read once, whichever thread asks
 
     # Steps --------------------------------------------------------------------------------------------------------
 
@@ -122,20 +119,12 @@ class Build:
     @property
     def plan(self) -> Plan:
         """What the cells agree on."""
-        if self._plan is None:
-            with np.load(self.work / "plan.npz") as data:
-                diagonal, variance, spacing, error, *whole = data["numbers"].tolist()
-                thin, first, rings, neighbours = map(int, whole)
-                self._plan = Plan(data["origin"], diagonal, Noise(variance, spacing), error, thin, first, data["cuts"],
-                                  rings, neighbours)
-        return self._plan
+        return self._once("plan", self._read_plan)
 
     @property
     def runs(self) -> Runs:
         """The points on disk."""
-        if self._runs is None:
-            self._runs = Runs(self.work / "runs", self.lattice())
-        return self._runs
+        return self._once("runs", lambda: Runs(self.work / "runs", self.lattice()))
 
     def make_coarse(self) -> None:
         """Make the levels before the cells' from the thinned copy."""
@@ -145,12 +134,12 @@ class Build:
             _write_surface(path, coarse.surface, copy_points=coarse.points, copy_normals=coarse.normals)
             self.device.trim()
 
-    def check(self, number: int, points=None) -> None:
+    def check(self, number: int) -> None:
         """Compare the coarse leaves with all points of a cell."""
         path = self.work / "checks" / f"{number:05d}.npz"
         if path.exists():
             return
-        points = cell_points(self.runs, self.plan, number, halo=False) if points is None else points
+        points = cell_points(self.runs, self.plan, number, halo=False)
         near, sums = check_cell(points, self.plan, self._made_coarse(), self.device)
         _write_arrays(path, near=near, sums=sums)
 
@@ -188,18 +177,11 @@ class Build:
         """Build cell `number` and write it as part number + 1."""
         if self.cell_written(number):
             return
-        self.write(number, *self.cell(cell_points(self.runs, self.plan, number)))
-        give_back()
-
-    def cell(self, points: CellPoints) -> tuple:
-        """Return a cell's surface and what is to be known of its distances (`build_cell`)."""
-        total = int(self.runs.counts.sum())
-        return build_cell(points, self.plan, self.options, self._checked_coarse(), self.device, total)
-
-    def write(self, number: int, surface, distance: NDArray) -> None:
-        """Write what `cell` returned for cell `number`."""
+        surface, distance = build_cell(cell_points(self.runs, self.plan, number), self.plan, self.options,
+                                       self._checked_coarse(), self.device, int(self.runs.counts.sum()))
         self._describe(number + 1, surface, distance)
         write_part(self.folder, number + 1, surface)
+        give_back()
 
     def finish(self, out: Path) -> None:
         """Write the index, drop what only the build needed, and give the folder its name."""
@@ -236,20 +218,32 @@ class Build:
 
     # What was made ------------------------------------------------------------------------------------------------
 
+    def _once(self, name: str, read):
+        with self._lock:
+            if name not in self._read:
+                self._read[name] = read()
+            return self._read[name]
+
+    def _read_plan(self) -> Plan:
+        with np.load(self.work / "plan.npz") as data:
+            diagonal, variance, spacing, error, *whole = data["numbers"].tolist()
+            thin, first, rings, neighbours = map(int, whole)
+            return Plan(data["origin"], diagonal, Noise(variance, spacing), error, thin, first, data["cuts"], rings,
+                        neighbours)
+
     def _made_coarse(self) -> Coarse:
-        if self._coarse is None:
-            with np.load(self.work / "coarse.npz") as data:
-                arrays = {name: data[name] for name in data.files}
-            values = json.loads(bytes(arrays.pop("values")).decode())
-            points, normals = arrays.pop("copy_points"), arrays.pop("copy_normals")
-            self._coarse = Coarse(from_arrays("slim", arrays, values), points, normals)
-        return self._coarse
+        return self._once("coarse", self._read_coarse)
+
+    def _read_coarse(self) -> Coarse:
+        with np.load(self.work / "coarse.npz") as data:
+            arrays = {name: data[name] for name in data.files}
+        values = json.loads(bytes(arrays.pop("values")).decode())
+        points, normals = arrays.pop("copy_points"), arrays.pop("copy_normals")
+        return Coarse(from_arrays("slim", arrays, values), points, normals)
 
     def _checked_coarse(self) -> Coarse:
-        if self._checked is None:
-            coarse = self._made_coarse()
-            self._checked = Coarse(load_part(self.folder, 0), coarse.points, coarse.normals)
-        return self._checked
+        coarse = self._made_coarse()
+        return self._once("checked", lambda: replace(coarse, surface=load_part(self.folder, 0)))
 
 
 def load_part(folder: Path, number: int):

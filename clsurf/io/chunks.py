@@ -130,20 +130,16 @@ class CloudSource(Source):
 class _Las(Source):
     def __init__(self, path: Path, chunk_points: int):
         super().__init__(path, chunk_points)
-        import laspy
-
-        from .las import _check_counts, _check_records
-        _check_records(path)
-        with laspy.open(path) as reader:
-            _check_counts(path, reader.header)
+        from .las import opened
+        with opened(path) as reader:
             self.count = reader.header.point_count
             self._names = set(reader.header.point_format.dimension_names)
         self.chunks = -(-self.count // chunk_points)
         self.airborne = bool(AIRBORNE & self._names)
 
     def _read(self, number: int) -> Chunk:
-        import laspy
-        with laspy.open(self.path) as reader:
+        from .las import opened
+        with opened(self.path) as reader:
             reader.seek(number * self.chunk_points)
             wanted = min(self.chunk_points, self.count - number * self.chunk_points)
             block = reader.read_points(wanted)

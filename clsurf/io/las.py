@@ -1,5 +1,6 @@
 """LAS, LAZ and COPC point clouds through laspy."""
 
+import contextlib
 import struct
 from pathlib import Path
 
@@ -18,6 +19,7 @@ _KEPT = ("intensity", "classification")  # other dimensions are dropped: nothing
 _SMALLEST_LAZ_POINT = 1 / 64  # bytes; laszip's chunks of equal points do not go below
 _SMALLEST_CHUNK = 20  # bytes; a chunk starts with a point as it is
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of point, colour, colour + infrared, wave packet; 14, bytes: one for each
+_LARGEST_CHUNK = 1 << 28  # bytes: the parallel decoder takes them at once, and where it can't ends the process
 _BLOCK = 2_000_000  # points decoded at once: autzen's 10.7 million peak at 0.6 GB instead of 1.1
 
 
@@ -32,19 +34,8 @@ def read_las(path: Path) -> PointCloud:
     FileFormatError
         A damaged or truncated file.
     """
-    _check_records(path)
-    try:
-        return _read(path)
-    except BaseException as error:
-        if type(error).__name__ != "PanicException":  # how the decoder's Rust code fails; not an Exception
-            raise
-        raise FileFormatError(f"{path}: damaged: {one_line(error)}") from None
-
-
-def _read(path: Path) -> PointCloud:
-    with laspy.open(path) as reader:
+    with opened(path) as reader:
         header = reader.header
-        _check_counts(path, header)
         if not header.point_count:
             return PointCloud(np.zeros((0, 3), np.float32))
         blocks, first = [], 0
@@ -63,6 +54,28 @@ def _read(path: Path) -> PointCloud:
     colors = as_rgba8(colors) if colors is not None and colors.any() else None  # all black: the scan has none
     attributes = {name: value for name, value in columns.items() if value.any()}
     return PointCloud(points, normals, colors, origin=middle * header.scales + header.offsets, attributes=attributes)
+
+
+@contextlib.contextmanager
+def opened(path: Path):
+    """Yield laspy's reader of a file whose counts the file has room for.
+
+    Raises
+    ------
+    FileFormatError
+        A damaged or truncated file, also where the decoder fails meanwhile.
+    """
+    _check_records(path)
+    try:
+        with laspy.open(path) as reader:
+            largest = _check_counts(path, reader.header)
+        backend = laspy.LazBackend.LazrsParallel if largest <= _LARGEST_CHUNK else laspy.LazBackend.Lazrs
+        with laspy.open(path, laz_backend=backend) as reader:
+            yield reader
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # how the decoder's Rust code fails; not an Exception
+            raise
+        raise FileFormatError(f"{path}: damaged: {one_line(error)}") from None
 
 
 def _columns(block, names: set[str], middle: NDArray, scales: NDArray) -> dict[str, NDArray]:
@@ -109,14 +122,17 @@ def _check_records(path: Path) -> None:
                               f"{size:,} bytes")
 
 
-def _check_counts(path: Path, header) -> None:
-    """Refuse counts that the file is too short for: the decoder takes memory for them and ends the process."""
+def _check_counts(path: Path, header) -> int:
+    """Refuse counts that the file is too short for: the decoder takes memory for them and ends the process.
+
+    Returns the bytes of the largest chunk when decoded, by the file's own word.
+    """
     size = path.stat().st_size
     width = _SMALLEST_LAZ_POINT if header.are_points_compressed else header.point_format.size
     if header.point_count * width > size:
         raise FileFormatError(f"{path}: truncated: {header.point_count:,} points do not fit in {size:,} bytes")
     if not header.are_points_compressed:
-        return
+        return 0
     with open(path, "rb") as file:
         file.seek(header.offset_to_point_data)
         at = int.from_bytes(file.read(8), "little", signed=True)
@@ -129,11 +145,14 @@ def _check_counts(path: Path, header) -> None:
         chunks = int.from_bytes(file.read(4), "little")
     if chunks * _SMALLEST_CHUNK > size:
         raise FileFormatError(f"{path}: damaged: {chunks:,} chunks of points do not fit in {size:,} bytes")
-    _check_chunks(path, header, size)
+    return _check_chunks(path, header, size)
 
 
-def _check_chunks(path: Path, header, size: int) -> None:
-    """Refuse chunks, and layers within them (point formats 6 to 10), whose lengths add up to more than the file."""
+def _check_chunks(path: Path, header, size: int) -> int:
+    """Refuse chunks, and layers within them (point formats 6 to 10), whose lengths add up to more than the file.
+
+    Returns the bytes of the largest chunk when decoded; the last one may say more points than are left for it.
+    """
     record = next(vlr for vlr in header.vlrs if vlr.record_id == 22204).record_data_bytes()
     compressor, items = struct.unpack("<H", record[:2])[0], struct.unpack("<H", record[32:34])[0]
     kinds = [struct.unpack("<HH", record[34 + 6 * i:38 + 6 * i]) for i in range(items)]
@@ -153,6 +172,7 @@ def _check_chunks(path: Path, header, size: int) -> None:
                 raise FileFormatError(f"{path}: damaged: a chunk of {length:,} bytes has layers of "
                                       f"{int(sizes.sum(dtype=np.int64)):,} bytes")
             at += length
+    return width * max((points for points, _ in table), default=0)
 
 
 def write_las(scan, path: Path) -> None:

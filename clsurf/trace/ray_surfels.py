@@ -17,7 +17,7 @@ from .ray_triangles import mesh_colors, plan_triangles
 from .tree import WIDTH, node_boxes, plant, room
 
 MARGIN = 1e-6  # of boxes, frame units: more than the kernel's rounding, as coordinates are at most 1 or so
-SLAB, LEAN = 0.3, 0.25  # kernels/trace/ray_surfels.cl
+DECIDES = 1.5  # largest radii past a ray's end within which discs decide on hits before it (ray_surfels.cl)
 
 
 @register(SurfelHierarchy)
@@ -40,24 +40,27 @@ def plan_surfels(surface: SurfelHierarchy) -> Plan:
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else 1.0
     centers, reach, own = (positions - middle) / unit, reach / unit + MARGIN, radii / unit
-    half, origin, slack = (high - low) / 2 / unit + 1e-3, surface.origin, float(1.01 * SLAB / LEAN * own.max())
+    half, origin, largest = (high - low) / 2 / unit + 1e-3, surface.origin, float(own.max())
     fields = np.concatenate([centers, normals, own[:, None]], axis=1).astype(np.float32)
 
     def hold(device, rows):
         some = slice(None) if rows is None else rows
-        launch = hold_discs(device, centers[some], reach[some], fields[some], base[some].astype(np.int32), slack)
+        launch = hold_discs(device, centers[some], reach[some], fields[some], base[some].astype(np.int32), largest,
+                            rows is not None)
         return Traced(origin + middle, unit, np.stack([-half, half]), launch)
 
     colors = surface.colors
     return Plan(hold, lambda: (centers - reach, centers + reach), surface.spacing,
                 None if colors is None else lambda surfels: LINEAR_OF_BYTE[colors[surfels, :3]],
-                radii=own, blend=1.01 * SLAB / LEAN, same=2e-6)
+                radii=own, blend=DECIDES, same=2e-6)
 
 
-def hold_discs(device: Device, centers: NDArray, reach: NDArray, fields: NDArray, numbers: NDArray, slack: float):
+def hold_discs(device: Device, centers: NDArray, reach: NDArray, fields: NDArray, numbers: NDArray, largest: float,
+               some: bool):
     """Put discs with the boxes centers -+ reach (n, 3) on the device; return what launches rays.
 
-    `fields` (n, 7): position, normal, radius; `slack`: how far along a ray discs may blend; frame units.
+    `fields` (n, 7): position, normal, radius; `largest`: radius of the surface's largest disc; frame units.
+    `some`: the discs are not all of the surface's.
     """
     slots, nodes = room(len(numbers))
     device.check_memory(discs=28 * slots, nodes=24 * WIDTH * nodes, numbers=4 * slots)
@@ -68,7 +71,7 @@ def hold_discs(device: Device, centers: NDArray, reach: NDArray, fields: NDArray
 
     def launch(mode, count, rays, hits):
         size, group, batch = items(device, count)
-        device.kernel("trace/ray_surfels.cl", constants={"VW": device.lanes, "MODE": mode})(
-            size, group, count, batch, tree.roots, tree.first_bottom, slack, *arrays, rays, hits)
+        device.kernel("trace/ray_surfels.cl", constants={"VW": device.lanes, "MODE": mode, "PIECES": some})(
+            size, group, count, batch, tree.roots, tree.first_bottom, largest, *arrays, rays, hits)
 
     return launch

@@ -25,10 +25,10 @@ __kernel void plain_cosines(int count, __global const uint *atlas, __global floa
              / VSQRT(x * x + y * y + z * z);
     along = SEL((VF)(-1.0f), along, AS_VI(code) < 0);  // the highest bit: covered
     // The corner of the texel next to the map's middle, in half texels: where it lies outside of the disc all does.
-    VI across = 2 * column + 1 - size, down = 2 * row + 1 - size;
-    across = SEL(across, -across, across < 0) - 1; down = SEL(down, -down, down < 0) - 1;
-    across = SEL(across, (VI)(0), across < 0); down = SEL(down, (VI)(0), down < 0);
-    least = VMIN(least, SEL((VF)(1.0f), along, across * across + down * down < texels));
+    // In floats, for which whole numbers like these are exact: Oclgrind has no magnitude of integers.
+    VF across = TO_VF(2 * column + 1 - size), down = TO_VF(2 * row + 1 - size), none = 0.0f;
+    across = VMAX(VMAX(across, -across) - 1.0f, none); down = VMAX(VMAX(down, -down) - 1.0f, none);
+    least = VMIN(least, SEL((VF)(1.0f), along, across * across + down * down < (float)texels));
   }
   float cosine = 1.0f;
   for (int i = 0; i < VW; i++) {

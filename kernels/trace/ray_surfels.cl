@@ -14,7 +14,13 @@ enum { D_X, D_Y, D_Z, D_NX, D_NY, D_NZ, D_RADIUS, FIELDS };
 #define SLAB 0.3f
 #define LEAN 0.25f
 
-typedef struct { float low, hit, face; int blending; } Goal;
+#ifndef PIECES
+#define PIECES 0  // 1: the discs are some of a surface's; hits that count only before a disc seen from behind say so
+#endif
+
+// What a walk looks for: the frontmost disc, only its side where that lies past the ray's end, or the blend.
+enum { FRONTMOST, PAST_END, BLENDED };
+typedef struct { float low, hit, face; int aim; } Goal;
 // `key` orders the hits: those from behind are set back. `whole` is the frontmost disc seen from its front, rest and all.
 // The sums are of the blend, `last` its deepest disc.
 typedef struct { float key; int slot; float t, face, whole; int whole_slot; float weight, depth, x, y, z, last; } Found;
@@ -32,7 +38,7 @@ INLINE void leaf_hit(const Ray *r, const Goal *goal, Model blocks, int bottom, F
     x -= t * r->dx; y -= t * r->dy; z -= t * r->dz;
     VF away2 = x * x + y * y + z * z;  // infinite or not a number along the plane: no hit
     VI front = along < 0.0f;
-    if (goal->blending) {
+    if (goal->aim == BLENDED) {
       VF steep = magnitude(along);
       VF apart = magnitude(t - goal->hit) * VMAX(steep, (VF)(LEAN));
       VI in = (away2 < radius * radius) & (apart < SLAB * radius) & (goal->face > 0.0f ? front : NOT(front));
@@ -60,42 +66,59 @@ INLINE void leaf_hit(const Ray *r, const Goal *goal, Model blocks, int bottom, F
     float least = lane_min(key);
     if (least >= found->key) continue;
     int lane = FIRST_BIT(bits_of(key == least));
-    found->key = least; found->slot = bottom * WIDE + part + lane;
+    found->key = least;
+    if (goal->aim == FRONTMOST) found->slot = bottom * WIDE + part + lane;
     found->t = LANE_OF(t, lane); found->face = LANE_OF(along, lane) < 0.0f ? 1.0f : -1.0f;
   }
 }
 
 #include "trace/ray_one.clh"
 
-__kernel void ray_surfels(int count, int batch, int roots, int first_bottom, float slack, __global const float *boxes,
+// `largest` is the radius of the largest disc.
+__kernel void ray_surfels(int count, int batch, int roots, int first_bottom, float largest, __global const float *boxes,
                           __global const float *blocks, __global const int *order, __global const float *rays,
                           __global float *hits) {
+  const float slack = 1.01f * SLAB / LEAN * largest;
   int begin = get_global_id(0) * batch, end = begin + batch < count ? begin + batch : count;
   for (int q = begin; q < end; q++) {
     __global float *out = hits + (size_t)q * HIT_FLOATS;
     if (MODE == NEXT && out[HIT_T] == INFINITY) continue;
     Ray r = load_ray(rays + (size_t)q * RAY_FLOATS);
     Goal goal;
-    goal.low = r.low; goal.hit = goal.face = 0.0f; goal.blending = 0;
+    goal.low = r.low; goal.hit = goal.face = 0.0f; goal.aim = FRONTMOST;
     if (MODE == NEXT && out[HIT_LOW] > goal.low) goal.low = out[HIT_LOW];
+    // The ray's end cuts hits off, not the discs that decide on them: those past it hide others that are seen from
+    // behind and set back past them, and a blend may lie before its frontmost disc.
+    Ray way = r;
+    if (MODE != ANY && r.low <= r.far) way.far = r.far + slack + BACK * largest;
     Found found;
-    found.key = found.whole = INFINITY; found.slot = found.whole_slot = -1;
+    found.key = MODE == ANY ? INFINITY : way.far;
+    found.whole = INFINITY; found.slot = found.whole_slot = -1;
     found.t = found.face = found.weight = found.depth = found.x = found.y = found.z = 0.0f;
-    walk_one(&r, &goal, blocks, roots, first_bottom, boxes, &found);
-    if (found.slot < 0) { out[HIT_T] = INFINITY; out[HIT_PRIMITIVE] = as_float(-1); continue; }
+    walk_one(&way, &goal, blocks, roots, first_bottom, boxes, &found);
+    int waits = 0;  // for what other pieces have behind
+    if (PIECES && MODE != ANY) {
+      waits = found.slot < 0 && found.whole < INFINITY;
+      if (waits) { found.slot = found.whole_slot; found.t = found.whole; found.face = 1.0f; }
+    } else if (found.slot < 0 && found.whole < INFINITY) {  // a gap if the disc past the end is seen from behind
+      way.far = FARTHEST; found.key = INFINITY; goal.aim = PAST_END;
+      walk_one(&way, &goal, blocks, roots, first_bottom, boxes, &found);
+    }
     if (found.face < 0.0f && found.whole < found.t) {
       found.slot = found.whole_slot; found.t = found.whole; found.face = 1.0f;
     }
+    if (found.slot < 0) { out[HIT_T] = INFINITY; out[HIT_PRIMITIVE] = as_float(-1); continue; }
     int slot = found.slot;
     float t = found.t;
     found.last = t;
 #if MODE != ANY
     Ray near = r;
     near.far = t + slack;
-    goal.low = t - slack; goal.hit = t; goal.face = found.face; goal.blending = 1;
+    goal.low = t - slack; goal.hit = t; goal.face = found.face; goal.aim = BLENDED;
     found.key = t + slack;
     walk_one(&near, &goal, blocks, roots, first_bottom, boxes, &found);
     if (found.weight > 0.0f) t = found.depth / found.weight;
+    if (t > r.far) { out[HIT_T] = INFINITY; out[HIT_PRIMITIVE] = as_float(-1); continue; }
 #else
     __global const float *k = blocks + (size_t)(slot / WIDE) * (FIELDS * WIDE) + slot % WIDE;
     found.x = k[D_NX * WIDE]; found.y = k[D_NY * WIDE]; found.z = k[D_NZ * WIDE];
@@ -104,7 +127,7 @@ __kernel void ray_surfels(int count, int batch, int roots, int first_bottom, flo
     out[HIT_NORMAL] = found.face * found.x; out[HIT_NORMAL + 1] = found.face * found.y;
     out[HIT_NORMAL + 2] = found.face * found.z;
     out[HIT_PRIMITIVE] = as_float(order[slot]);
-    out[HIT_SIDE] = found.face;
+    out[HIT_SIDE] = waits ? 3.0f : found.face;
     out[HIT_LOW] = found.last > t ? found.last : t; out[HIT_STATE] = 0.0f;
   }
 }
