@@ -20,7 +20,7 @@ from clsurf.render.shade import Light, Shading
 from clsurf.render.slim import place_slim, upload_slim
 from clsurf.render.tiles import Layout
 from clsurf.trace.packets import packet_lanes, trace_pixels
-from clsurf.trace.slim import kept_traced
+from clsurf.trace.pieces import traced
 
 from . import peers, record, scenes
 from .build import WrongAnswer, built
@@ -103,11 +103,11 @@ def primary(name: str, surface, device, size, runs: int) -> dict:
     touched = device.empty((bins[0] * bins[1],), np.int32)
     planes = device.empty((bins[0] * bins[1], layout.constants["FIELDS"], 64), np.float32)
     view = device.upload(place_slim(upload_slim(device, surface), None, camera, size, 0.0)[0])
-    traced = kept_traced(device, surface)
+    packets = traced(device, surface).packets
 
     def run():
         device.fill(touched, -1)
-        trace_pixels(device, packet_lanes(device.lanes), traced, view, layout.constants, 0, None, *bins, touched,
+        trace_pixels(device, packet_lanes(device.lanes), packets, view, layout.constants, 0, None, *bins, touched,
                      planes)
         device.finish()
 

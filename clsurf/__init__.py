@@ -47,7 +47,8 @@ from .surface.ranges import RangeImage, RangeScan
 from .surface.scale_map import ScaleMap
 from .surface.slim import SlimSurface
 from .surface.surfel import SurfelHierarchy
-from .trace.hits import Hits, trace
+from .trace.hits import trace
+from .trace.rays import Hits
 from .view.canvas import view
 from .view.viewer import Viewer
 

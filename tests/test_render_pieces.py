@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from reference.scale_map import smooth_map
+from reference.small_device import small
 
 import clsurf
 from clsurf import models
@@ -99,3 +101,29 @@ def test_what_cannot_be_cut_is_told(device, monkeypatch):
     monkeypatch.setattr(device, "largest_buffer_bytes", 5000)
     with clsurf.Renderer(device) as renderer, pytest.raises(DeviceMemoryError):
         renderer.render(mesh(), size=(32, 32))
+
+
+@pytest.mark.parametrize("lanes", (16, 1))
+@pytest.mark.parametrize("drawing", (clsurf.ScaleMapDrawing(), clsurf.ScaleMapDrawing("geosphere", 5)))
+def test_maps_larger_than_a_device_are_drawn_in_parts(device, lanes, drawing):
+    """Blocks, and layers, one after the other, to the picture of the whole."""
+    base = smooth_map(48, f=bumpy)
+    scales = np.concatenate([base.scales, base.scales * np.float32(0.7)])
+    surface = clsurf.ScaleMap(base.center, base.radius, scales, np.concatenate([base.valid] * 2))
+    camera = clsurf.Camera.framing(surface, direction=(0.4, -0.6, 1))
+    channels = ("color", "depth", "normal", "id", "level")
+    with clsurf.Renderer(device, lanes=lanes) as renderer:
+        wanted = renderer.render(surface, camera, SIZE, channels, scale_map=drawing)
+    again = clsurf.ScaleMap(base.center, base.radius, scales, surface.valid)
+    with small(device, 400_000) as used, clsurf.Renderer(device, lanes=lanes) as renderer:
+        for _ in range(2):
+            got = renderer.render(again, camera, SIZE, channels, scale_map=drawing)
+            for name in channels:
+                # Where a ray meets the edge of a block, the first one drawn is seen.
+                np.testing.assert_allclose(got.channels[name], wanted.channels[name], atol=1e-3, err_msg=name)
+                assert (got.channels[name] != wanted.channels[name])[wanted.id >= 0].mean() < 0.01
+    assert used["most"] > 400_000
+
+
+def bumpy(directions):
+    return 1 + 0.1 * np.sin(7 * directions[..., 0]) * np.cos(5 * directions[..., 1])

@@ -1,5 +1,7 @@
 """Shadows and ambient occlusion in pictures: closed forms, the twins, and what users may ask for."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 from reference import render as reference
@@ -17,8 +19,9 @@ from clsurf.render.tiles import view_floats
 from clsurf.render.traced_light import sphere_lamps
 from clsurf.surface.mesh import Mesh
 from clsurf.surface.patch import PatchSurface
-from clsurf.trace.kinds import Traced, traced
+from clsurf.trace.kinds import Traced
 from clsurf.trace.packets import trace_lights
+from clsurf.trace.pieces import held
 from clsurf.trace.slim import upload_traced
 
 FORMS = (16, 1)
@@ -251,15 +254,18 @@ def test_patches_occlude(below):
 def test_single_rays_cast_the_shadows_of_packets(device, monkeypatch, light):
     """Whatever is traced casts: a kind needs to tell no more than where rays hit it."""
     packets = picture(device, [light])
-    monkeypatch.setattr(casters, "traced", lambda device, surface: bare(traced(device, surface)))
+    monkeypatch.setattr(casters, "held", lambda device, surface: bare(held(device, surface)))
     singles = picture(device, [light])
     on_plane = packets.id == 0
     dark = packets.color[on_plane][:, 0] == 0
     assert dark.sum() > 300 and ((singles.color[on_plane][:, 0] == 0) != dark).mean() < 0.01
 
 
-def bare(held):
-    return Traced(held.center, held.unit, held.box, held.launch)
+def bare(one):
+    one = copy(one)
+    one.packets, one.whole = False, Traced(one.whole.center, one.whole.unit, one.whole.box, one.whole.launch)
+    one.grain = one.whole.grain
+    return one
 
 
 def test_lamp_rays(device):

@@ -33,10 +33,10 @@ def hybrid(device):
 @pytest.fixture(params=(16, 4, 1))
 def form(request, device, monkeypatch):
     monkeypatch.setattr(device, "lanes", request.param)
-    from clsurf.trace import kinds
-    kinds._kept.__dict__.clear()  # surfaces on the device know their kernel form
+    from clsurf.trace import pieces
+    pieces._kept.__dict__.clear()  # surfaces on the device know their kernel form
     yield device
-    kinds._kept.__dict__.clear()
+    pieces._kept.__dict__.clear()
 
 
 def random_rays(n, seed=0, reach=3.0):

@@ -7,7 +7,8 @@ from reference.ray_scenes import slim_sphere, sphere_mesh
 import clsurf
 from clsurf import Mesh
 from clsurf.errors import Cancelled, InputError
-from clsurf.trace.kinds import ANY, CLOSEST, traced
+from clsurf.trace.kinds import ANY, CLOSEST
+from clsurf.trace.pieces import traced
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +131,10 @@ def test_mistakes_are_told(device):
 
 def test_uploads_live_as_long_as_their_surface(device):
     """A second trace of the same surface puts nothing on the device; nothing is kept of one that is gone."""
-    from clsurf.trace import kinds
+    from clsurf.trace import pieces
     mesh = sphere_mesh(4, 6)
     clsurf.trace(mesh, (0, 0, 3), (0, 0.1, -1), device=device)
-    kept = kinds._kept.__dict__[id(device)]
+    kept = pieces._kept.__dict__[id(device)]
     first = kept[mesh]
     clsurf.trace(mesh, (0, 0, 3), (0, 0.1, -1), device=device)
     assert kept[mesh] is first

@@ -9,7 +9,7 @@ import clsurf
 from clsurf import Camera, Mesh, PatchDrawing, Scene
 from clsurf.render.renderer import Renderer
 from clsurf.surface.placed import placed
-from clsurf.trace import hits as hits_module
+from clsurf.trace import tracers
 from clsurf.trace.ray_slim import neighbour_lists
 from clsurf.trace.tree import node_boxes, plant
 
@@ -300,18 +300,18 @@ def test_results_do_not_depend_on_order_or_chunks(device, sphere, monkeypatch):
     shuffled = clsurf.trace(sphere, origins[order], directions[order], device=device)
     np.testing.assert_array_equal(shuffled.distance, hits.distance[order])
     np.testing.assert_array_equal(shuffled.normal, hits.normal[order])
-    monkeypatch.setattr(hits_module, "CHUNK", 256)
-    monkeypatch.setattr(hits_module, "SLAB", 1024)
+    monkeypatch.setattr(tracers, "CHUNK", 256)
+    monkeypatch.setattr(tracers, "SLAB", 1024)
     seen = []
     again = clsurf.trace(sphere, origins, directions, device=device, progress=lambda *step: seen.append(step))
     np.testing.assert_array_equal(again.position, hits.position)
     assert len(seen) == 12 and seen[-1] == ("trace", 1.0)
-    monkeypatch.setattr(hits_module, "has_doubles", lambda device: False)
+    monkeypatch.setattr(tracers, "has_doubles", lambda device: False)
     for query in ("closest", "any"):
         host = clsurf.trace([sphere_mesh(), sphere], origins, directions, query, device=device)
         monkeypatch.undo()
         both = clsurf.trace([sphere_mesh(), sphere], origins, directions, query, device=device)
-        monkeypatch.setattr(hits_module, "has_doubles", lambda device: False)
+        monkeypatch.setattr(tracers, "has_doubles", lambda device: False)
         assert (host.hit == both.hit).mean() > 0.999
         same = host.hit & both.hit & (host.surface == both.surface)
         np.testing.assert_allclose(host.distance[same], both.distance[same], rtol=1e-5)

@@ -1,10 +1,12 @@
 """Nearest triangles of meshes."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
-from ..errors import InputError
+from ..errors import DeviceMemoryError, InputError
 from .point_tree import BLOCK, build_boxes, column_bounds, morton_order
 
 TRIANGLE = 12  # floats a triangle (triangle_distances.cl)
@@ -40,10 +42,65 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
     box = column_bounds(corners.reshape(-1, 3))
     middle, unit = box.mean(axis=0), max(float(np.linalg.norm(box[1] - box[0])), np.finfo(np.float32).tiny)
     corners = (corners - middle) / unit
+    found, number = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+    batch = max(min(BATCH, device.largest_buffer_bytes // 12 // BLOCK * BLOCK), BLOCK)
+
+    def ask(rows: NDArray) -> None:
+        """Look among some triangles; in halves where the device does not hold them at once."""
+        try:
+            tree = triangle_tree(corners[rows], device)
+        except DeviceMemoryError:
+            if len(rows) < 2:
+                raise
+        else:
+            for start in range(0, len(points), batch):
+                part = slice(start, start + batch)
+                local = (np.asarray(points[part], np.float64) - middle) / unit
+                away, at = tree.nearest(np.ascontiguousarray(local, np.float32))
+                nearer = away < found[part]
+                found[part][nearer], number[part][nearer] = away[nearer], kept[rows[at[nearer]]]
+            return
+        axis = int(np.argmax(np.ptp(corners[rows, 0], axis=0)))
+        order = np.argpartition(corners[rows, 0, axis], len(rows) // 2)
+        for half in (order[:len(rows) // 2], order[len(rows) // 2:]):
+            ask(rows[np.sort(half)])
+
+    ask(np.arange(len(corners)))
+    return found * unit, number
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleTree:
+    """Triangles on a device, along the Morton curve, with a tree over their balls (triangle_distances.cl)."""
+
+    device: Device
+    arrays: tuple
+    order: NDArray
+    margin: float
+
+    def nearest(self, points: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the distances (n,) of points (n, 3) float32 to the nearest triangle, and its number (n,)."""
+        device, count = self.device, len(points)
+        order, _, _ = morton_order(points, device)
+        stride = -(-count // BLOCK) * BLOCK
+        queries = np.zeros((3, stride), np.float32)
+        queries[:, :count] = points[order].T
+        found, at = device.empty(stride, np.float32), device.empty(stride, np.int32)
+        device.kernel("build/triangle_distances.cl")((stride // BLOCK,), (1,), count, stride, device.upload(queries),
+                                                     *self.arrays, self.margin, found, at)
+        away, number = np.empty(count, np.float32), np.empty(count, np.int64)
+        away[order] = device.download(found, copy=False)[:count]
+        number[order] = self.order[device.download(at, copy=False)[:count]]
+        return away, number
+
+
+def triangle_tree(corners: NDArray, device: Device) -> TriangleTree:
+    """Put triangles (f, 3, 3) float64, within about 1 of zero, on the device."""
+    padded = -(-len(corners) // BLOCK) * BLOCK
+    device.check_memory(triangles=4 * TRIANGLE * padded, balls=16 * padded)
     centroid = corners.mean(axis=1)
     order, _, _ = morton_order(np.ascontiguousarray(centroid, np.float32), device)
-    corners, centroid, kept = corners[order], centroid[order], kept[order]
-    padded = -(-len(order) // BLOCK) * BLOCK
+    corners, centroid = corners[order], centroid[order]
     records = np.zeros((padded, TRIANGLE), np.float32)
     records[:len(order), :3] = corners[:, 0]
     records[:len(order), 3:9] = (corners[:, 1:] - corners[:, :1]).reshape(-1, 6)
@@ -52,22 +109,9 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
     balls[:3], balls[3] = np.repeat(centroid[-1:].T, padded, axis=1), -1  # the padding is never near
     balls[:3, :len(order)], balls[3, :len(order)] = centroid.T, radius
     on_device = device.upload(balls)
-    tree = (device.upload(records), padded, on_device,
-            *build_boxes(on_device, padded, device, radius=device.upload(balls[3])))
-    kernel = device.kernel("build/triangle_distances.cl")
-    margin = float(np.median(radius))
-    out, number = np.empty(len(points)), np.empty(len(points), np.int64)
-    for start in range(0, len(points), BATCH):
-        local = np.ascontiguousarray((np.asarray(points[start:start + BATCH], np.float64) - middle) / unit, np.float32)
-        order, _, _ = morton_order(local, device)
-        stride = -(-len(local) // BLOCK) * BLOCK
-        queries = np.zeros((3, stride), np.float32)
-        queries[:, :len(local)] = local[order].T
-        found, at = device.empty(stride, np.float32), device.empty(stride, np.int32)
-        kernel((stride // BLOCK,), (1,), len(local), stride, device.upload(queries), *tree, margin, found, at)
-        out[start + order] = device.download(found, copy=False)[:len(local)]
-        number[start + order] = kept[device.download(at, copy=False)[:len(local)]]
-    return out * unit, number
+    arrays = (device.upload(records), padded, on_device,
+              *build_boxes(on_device, padded, device, radius=device.upload(balls[3])))
+    return TriangleTree(device, arrays, order, float(np.median(radius)))
 
 
 def barycentric_foot(points: NDArray, corners: NDArray) -> tuple[NDArray, NDArray]:

@@ -30,7 +30,7 @@ def trace(source: Annotated[Path, typer.Argument(help="A surface, a mesh, or ano
     import clsurf
 
     from ..render.checked import checked_size
-    from ..trace.hits import QUERIES
+    from ..trace.tracers import QUERIES
     # Every option is checked before the work.
     steps, picture_size = Steps(quiet), checked_size(parsed_size(size))
     checked_out(out, TABLES if rays is not None else TABLES + DEPTHS)

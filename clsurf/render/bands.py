@@ -37,27 +37,36 @@ class BandCamera(Camera):
         return replace(p, cy=p.cy - factor * self.first_row)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class BandScene(Scene):
+    """What of a scene a band may show; `whole` throws shadows and is mirrored."""
+
+    whole: Scene | None = None
+
+
+def whole_of(scene: Scene) -> Scene:
+    """Return the scene that a scene is a band's part of, or itself."""
+    return getattr(scene, "whole", None) or scene
+
+
 def band_of(camera: Camera, whole: tuple[int, int], first_row: int) -> BandCamera:
     """Return `camera` for the rows from `first_row` on of a picture of size `whole`."""
     return BandCamera(camera.eye, camera.rotation, camera.fov, camera.height, camera.intrinsics,
                       camera.intrinsics_size, camera.near, whole, first_row)
 
 
-def draw_in_bands(draw, scene: Scene, camera: Camera, size: tuple[int, int], cull: bool) -> Frame:
+def draw_in_bands(draw, scene: Scene, camera: Camera, size: tuple[int, int]) -> Frame:
     """Return the frame of a picture whose parts `draw` can draw.
 
     Parameters
     ----------
     draw : callable
         draw(scene, camera, size) gives a Frame or raises DeviceMemoryError.
-    cull : bool
-        Whether what lies outside a band may be left out: not where it throws shadows or is mirrored.
     """
     def band(first: int, rows: int) -> list[Frame]:
         seen = band_of(camera, size, first)
-        part = culled(scene, seen, (size[0], rows)) if cull else scene
         try:
-            frame = draw(part, seen, (size[0], rows))
+            frame = draw(culled(scene, seen, (size[0], rows)), seen, (size[0], rows))
             return [Frame({name: np.array(array) for name, array in frame.channels.items()}, frame.origin)]
         except DeviceMemoryError:
             if rows <= ROWS:
@@ -84,7 +93,7 @@ def culled(scene: Scene, camera: Camera, size: tuple[int, int]) -> Scene:
             surfaces.append(Placed(part, matrix) if isinstance(surface, Placed) else part)
         else:
             surfaces.append(surface)
-    return replace(scene, surfaces=surfaces)
+    return BandScene(surfaces, scene.lights, scene.materials, scene)
 
 
 def seen_surfels(surface: SlimSurface, matrix: NDArray | None, camera: Camera, size: tuple[int, int]) -> NDArray:

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..surface.srgb import to_linear
-from ..trace.hits import Hits, trace
-from ..trace.kinds import traceable, traced
+from ..trace.hits import trace
+from ..trace.kinds import traceable
+from ..trace.pieces import held
+from ..trace.rays import Hits
 from .backdrop import Backdrop
 from .light import KINDS, LIGHT_FLOATS
 from .lighting import Lighting, surface_shading
@@ -51,7 +53,7 @@ def grain(device: Device, surface, matrix) -> float:
     scale = 1.0 if matrix is None else float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not traceable(surface):  # points, whose extent is their picture's
         return scale * POINT_GRAIN * float(np.nan_to_num(np.linalg.norm(np.ptp(surface.bounds, axis=0))))
-    return scale * traced(device, surface).grain
+    return scale * held(device, surface).grain
 
 
 def met(scene, origins, directions, query: str = "closest", device=None, **limits) -> Hits:
@@ -140,6 +142,6 @@ def base_colors(device: Device, scene, shading: Shading, surface: NDArray, primi
     for number, (own, _) in enumerate(scene.placed):
         here, look = surface == number, surface_shading(scene, shading, number)
         out[here] = to_linear(look.color)
-        if look.model_colors and here.any() and traced(device, own).colors is not None:
-            out[here] = traced(device, own).colors(primitive[here])
+        if look.model_colors and here.any() and held(device, own).colors is not None:
+            out[here] = held(device, own).colors(primitive[here])
     return out

@@ -18,9 +18,10 @@ from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
+from ..trace.pieces import forget
 from .average import average
 from .backdrop import around, lay_over
-from .bands import draw_in_bands
+from .bands import draw_in_bands, whole_of
 from .camera import Camera
 from .checked import picture_bytes
 from .clip import view_clip
@@ -41,6 +42,7 @@ from .request import Request, checked_request
 from .resident import Resident, resident_scene
 from .scale_map import draw_scale_map, upload_scale_map
 from .scale_map_drawing import ScaleMapDrawing
+from .scene import scene_origin
 from .shade import CHANNELS, Look, Shading, shade, shading_floats
 from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
@@ -199,8 +201,7 @@ class Renderer:
         if not scene.surfaces or 3 * picture_bytes(asked.size, asked.channels) > host_memory_bytes():
             raise failed
         self._give_back()
-        cull = not asked.shading.shadows and not asked.shading.occlusion and not asked.mirrored
-        return draw_in_bands(draw, scene, camera, asked.size, cull)
+        return draw_in_bands(draw, scene, camera, asked.size)
 
     def _frame(self, asked: Request, scene, camera: Camera, picture: tuple[int, int]) -> Frame:
         """Return the frame of `picture` (width, height): the stages of a frame, in their order."""
@@ -229,7 +230,8 @@ class Renderer:
         if asked.covered:
             self._cover(grid, scene, camera, look, whole, floats, lighting, arrays)
         if asked.mirrored:
-            reflect(self.device, scene, camera, shading, around(asked.back, scene), origin, floats, lighting, arrays)
+            self._with_room(reflect, self.device, whole_of(scene), camera, shading, around(asked.back, scene), origin,
+                            floats, lighting, arrays)
         if asked.factor > 1:
             arrays = average(self.device, arrays, picture, asked.factor, asked.kept, asked.curved,
                              self._scratch.lanes)
@@ -267,7 +269,17 @@ class Renderer:
         if grid.layout.unlit and look.points.eye_dome is not False:
             eye_dome(self.device, self._scratch, grid, look.points, camera, factor)
         if lighting is not None:
-            light_grid(self.device, self._scratch, grid, scene, camera, look.shading, floats, look.lamps, lighting)
+            self._with_room(light_grid, self.device, self._scratch, grid, whole_of(scene), camera, look.shading,
+                            floats, look.lamps, lighting)
+
+    def _with_room(self, stage, *arguments) -> None:
+        """Run a stage whose rays need surfaces on the device; where that lacks memory, without what drew them."""
+        try:
+            return stage(*arguments)
+        except DeviceMemoryError:
+            self._uploads.clear()
+        forget(self.device)
+        return stage(*arguments)
 
     def _cut(self, scene) -> bool:
         """Cut patches that are drawn without planes; return whether anything was."""
@@ -350,14 +362,6 @@ def carries_colors(surface) -> bool:
     if isinstance(surface, RangeScan):
         return all(image.color is not None for image in surface.images)
     return any(getattr(surface, name, None) is not None for name in OWN_COLORS)
-
-
-def scene_origin(scene) -> np.ndarray:
-    """Return the world position (3,) float64 that the channel "position" is relative to: the first surface's zero."""
-    if not scene.surfaces:
-        return np.zeros(3)
-    surface, matrix = scene.placed[0]
-    return surface.origin.copy() if matrix is None else matrix[:3, :3] @ surface.origin + matrix[:3, 3]
 
 
 def framing(scene, size) -> Camera:

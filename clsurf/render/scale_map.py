@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
-from ..errors import InputError
+from ..errors import DeviceMemoryError, InputError
 from ..surface.cube import border_directions, bordered
 from ..surface.geosphere import geosphere_directions
 from ..surface.scale_map import ScaleMap
@@ -37,7 +37,7 @@ class ScaleMapUpload:
     radius: float
     reach: float  # the surface's largest distance from the centre, radii
     closed: bool  # one layer without holes
-    rho: DeviceArray  # (layers, 6, size + 2, size + 2) float32, -1: a hole
+    rho: NDArray  # (layers, 6, size + 2, size + 2) float32, -1: a hole; on the host
     directions: DeviceArray  # (6, size + 2, size + 2, 3) float32
     surface: weakref.ref
     made: dict = field(default_factory=dict)
@@ -59,6 +59,7 @@ class Cells:
     stride: int
     positions: DeviceArray  # (3, stride) float32, radii; NaN: a hole
     nodes: DeviceArray  # (grids * side^2, 4) float32: normal, distance in radii
+    first_layer: int = 0  # of the map
 
     @property
     def blocks_side(self) -> int:
@@ -85,14 +86,14 @@ def upload_scale_map(device: Device, surface: ScaleMap) -> ScaleMapUpload:
     if nodes > LARGEST_NODES:
         raise InputError(f"surface: expected a scale map of at most {LARGEST_NODES:,} texels to draw, got {nodes:,}: "
                          "build it with a smaller size or fewer layers")
-    device.check_memory(texels=8 * nodes, directions=72 * (size + 2) ** 2, nodes=32 * nodes)
+    device.check_memory(directions=72 * (size + 2) ** 2)
     rho = np.empty((layers, 6, size + 2, size + 2), np.float32)
     for k in range(layers):
         values, valid = bordered(np.nan_to_num(surface.lambdas[k]), surface.valid[k], size)
         rho[k] = np.where(valid, values, -1)
     directions = np.ascontiguousarray(border_directions(size), np.float32)
     return ScaleMapUpload(size, layers, surface.center, surface.radius, max(float(rho.max()), 1e-6),
-                          layers == 1 and bool(surface.valid.all()), device.upload(rho), device.upload(directions),
+                          layers == 1 and bool(surface.valid.all()), rho, device.upload(directions),
                           weakref.ref(surface))
 
 
@@ -114,7 +115,7 @@ def scale_normals(device: Device, upload: ScaleMapUpload, layer: int, drawing: S
                              "normals=True, or draw it with normals=\"gradient\"")
         return np.concatenate([surface.unit_normals()[layer], np.nan_to_num(surface.lambdas[layer])[..., None]], axis=3)
     out = device.empty((6 * size * size, 4), np.float32)
-    part = device.upload(device.download(upload.rho, copy=False)[layer])
+    part = device.upload(upload.rho[layer])
     epsilon = 2 / size if drawing.epsilon is None else drawing.epsilon
     items = -(-6 * size * size // device.lanes)
     device.kernel("render/scale_normals.cl", constants={"VW": device.lanes, "GRADIENT": kind == "gradient"})(
@@ -126,37 +127,40 @@ def bordered_normals(device: Device, upload: ScaleMapUpload, layer: int, drawing
     """Return the normals of `scale_normals` with the border, (6, size + 2, size + 2, 4) float32."""
     normals, _ = bordered(scale_normals(device, upload, layer, drawing), upload.surface().valid[layer], upload.size)
     normals[..., :3] /= np.maximum(np.linalg.norm(normals[..., :3], axis=-1, keepdims=True), 1e-20)
-    normals[..., 3] = device.download(upload.rho, copy=False)[layer]
+    normals[..., 3] = upload.rho[layer]
     return normals
 
 
-def cells_of(device: Device, upload: ScaleMapUpload, drawing: ScaleMapDrawing) -> Cells:
-    """Return the nodes that a map is drawn with; made once for each way of drawing."""
-    key = (drawing.form, drawing.level if drawing.form == "geosphere" else 0, drawing.normals, drawing.epsilon)
+def cells_of(device: Device, upload: ScaleMapUpload, drawing: ScaleMapDrawing, layers: range | None = None) -> Cells:
+    """Return the nodes that a map, or some of its layers, are drawn with; all of them are made once for each way."""
     make = _geosphere_cells if drawing.form == "geosphere" else _texel_cells
-    return upload.once(key, lambda: make(device, upload, drawing))
+    if layers is not None:
+        return make(device, upload, drawing, layers)
+    key = (drawing.form, drawing.level if drawing.form == "geosphere" else 0, drawing.normals, drawing.epsilon)
+    return upload.once(key, lambda: make(device, upload, drawing, range(upload.layers)))
 
 
-def _texel_cells(device, upload, drawing) -> Cells:
-    side, layers = upload.size + 2, upload.layers
-    nodes = np.concatenate([bordered_normals(device, upload, k, drawing).reshape(-1, 4) for k in range(layers)])
+def _texel_cells(device, upload, drawing, layers) -> Cells:
+    side = upload.size + 2
+    _check_nodes(device, 6 * len(layers) * side**2)
+    nodes = np.concatenate([bordered_normals(device, upload, k, drawing).reshape(-1, 4) for k in layers])
     rho = nodes[:, 3:]
-    points = np.where(rho < 0, np.nan, rho) * np.tile(border_directions(upload.size).reshape(-1, 3), (layers, 1))
-    return _cells(device, True, side, 6 * layers, points, nodes)
+    points = np.where(rho < 0, np.nan, rho) * np.tile(border_directions(upload.size).reshape(-1, 3), (len(layers), 1))
+    return _cells(device, True, side, layers, 6, points, nodes)
 
 
-def _geosphere_cells(device, upload, drawing) -> Cells:
+def _geosphere_cells(device, upload, drawing, layers) -> Cells:
     steps = 2**drawing.level
     directions = geosphere_directions(steps)
     count, side = directions.size // 3, steps + 1
     if count * upload.layers > LARGEST_NODES:
         raise InputError(f"scale map level: expected at most {LARGEST_NODES:,} nodes over all layers, got "
                          f"{count * upload.layers:,}: use a lower level")
-    device.check_memory(nodes=44 * count * upload.layers)
+    _check_nodes(device, count * len(layers))
     host, points = [], []
     aimed = device.upload(np.ascontiguousarray(directions.reshape(-1, 3), np.float32))
-    for k in range(upload.layers):
-        rho = device.upload(device.download(upload.rho, copy=False)[k])
+    for k in layers:
+        rho = device.upload(upload.rho[k])
         normals = device.upload(np.ascontiguousarray(bordered_normals(device, upload, k, drawing), np.float32))
         positions, nodes = device.empty((3, count), np.float32), device.empty((count, 4), np.float32)
         items = -(-count // device.lanes)
@@ -164,16 +168,20 @@ def _geosphere_cells(device, upload, drawing) -> Cells:
             (items,), (min(16, items),), count, upload.size, rho, normals, aimed, count, positions, nodes)
         points.append(device.download(positions).T)
         host.append(device.download(nodes))
-    return _cells(device, False, side, 10 * upload.layers, np.concatenate(points), np.concatenate(host))
+    return _cells(device, False, side, layers, 10, np.concatenate(points), np.concatenate(host))
 
 
-def _cells(device, cast, side, grids, points, nodes) -> Cells:
+def _check_nodes(device: Device, count: int) -> None:
+    device.check_memory(positions=12 * count, nodes=16 * count)
+
+
+def _cells(device, cast, side, layers, grids, points, nodes) -> Cells:
     count = len(points)
     stride = -(-(count + BLOCK_SIDE * side + BLOCK_SIDE) // 64) * 64  # blocks read past the last node
     positions = np.full((3, stride), np.nan, np.float32)
     positions[:, :count] = points.T
     nodes = np.ascontiguousarray(nodes, np.float32)
-    cells = Cells(cast, side, grids, stride, device.upload(positions), device.upload(nodes))
+    cells = Cells(cast, side, grids * len(layers), stride, device.upload(positions), device.upload(nodes), layers[0])
     if cells.blocks > LARGEST_BLOCKS:
         raise InputError(f"scale map: expected at most {LARGEST_BLOCKS:,} blocks of cells, got {cells.blocks:,}: use a "
                          "smaller size or a lower level")
@@ -196,16 +204,17 @@ def place_scale_map(upload: ScaleMapUpload, matrix: NDArray | None, camera, size
     return view, upload.closed and bool(middle - reach > nearest)
 
 
-def project_cells(device: Device, scratch: Scratch, cells: Cells, view: DeviceArray,
-                  cull: bool) -> tuple[DeviceArray, Footprints]:
-    """Return the records of all blocks and where they touch the picture."""
-    count = cells.blocks
+def project_cells(device: Device, scratch: Scratch, cells: Cells, view: DeviceArray, cull: bool,
+                  blocks: range | None = None) -> tuple[DeviceArray, Footprints]:
+    """Return the records of some blocks, None: all, and where they touch the picture."""
+    blocks = range(cells.blocks) if blocks is None else blocks
+    count = len(blocks)
     device.check_memory(records=4 * RECORD_FLOATS * count)
     records = scratch.array("records", (count, RECORD_FLOATS), np.float32)
     touch = new_footprints(device, scratch, count)
     device.kernel("render/project_cells.cl", constants={"VW": scratch.lanes, "CULL": cull, "WHOLE": cells.cast})(
-        (count,), (min(64, count),), view, cells.positions, cells.stride, cells.side, cells.blocks_side, count, records,
-        touch.full, touch.core, touch.keys, touch.buckets)
+        (count,), (min(64, count),), view, cells.positions, cells.stride, cells.side, cells.blocks_side, blocks.start,
+        count, records, touch.full, touch.core, touch.keys, touch.buckets)
     return records, touch
 
 
@@ -216,16 +225,40 @@ def tile_cells(device: Device, scratch: Scratch, grid: Grid, cells: Cells, view:
     constants = grid.layout.constants | {"VW": scratch.lanes, "CAST": cells.cast, "TILE_BINS": grid.tile_bins}
     device.kernel("render/tile_cells.cl", constants=constants)(
         (grid.tile_count * group,), (group,), view, pairs.pairs, pairs.offsets, records, cells.nodes, cells.side,
-        cells.side**2, number, grid.tiles_x, grid.tile_count, grid.bins_x, grid.bins_y, grid.touched, grid.planes)
+        cells.side**2, cells.first_layer, number, grid.tiles_x, grid.tile_count, grid.bins_x, grid.bins_y, grid.touched,
+        grid.planes)
 
 
 def draw_scale_map(device: Device, scratch: Scratch, grid: Grid, upload: ScaleMapUpload, matrix, camera, look: Look,
                    number: int) -> None:
-    """Run all stages of one placed map: nodes (kept), project, bin, tile."""
-    cells = cells_of(device, upload, look.scale_map)
+    """Draw one placed map; layers and blocks that the device does not hold at once, one after the other."""
     floats, cull = place_scale_map(upload, matrix, camera, grid.size, look.shading.color)
-    view = device.upload(grid.clip_into(floats))
-    records, footprints = project_cells(device, scratch, cells, view, cull and not grid.layout.clip_planes)
-    pairs = bin_pairs(device, scratch, grid, footprints, cells.blocks)
-    if pairs is not None:
-        tile_cells(device, scratch, grid, cells, view, records, pairs, number)
+    view, cull = device.upload(grid.clip_into(floats)), cull and not grid.layout.clip_planes
+
+    def draw(cells: Cells, blocks: range) -> None:
+        try:
+            records, footprints = project_cells(device, scratch, cells, view, cull, blocks)
+            pairs = bin_pairs(device, scratch, grid, footprints, len(blocks))
+        except DeviceMemoryError:
+            if len(blocks) < 2:
+                raise
+        else:
+            if pairs is not None:
+                tile_cells(device, scratch, grid, cells, view, records, pairs, number)
+            return
+        for half in (blocks[:len(blocks) // 2], blocks[len(blocks) // 2:]):
+            draw(cells, half)
+
+    try:
+        cells = cells_of(device, upload, look.scale_map)
+    except DeviceMemoryError:
+        if upload.layers < 2:
+            raise
+    else:
+        draw(cells, range(cells.blocks))
+        return
+    for k in range(upload.layers):
+        cells = cells_of(device, upload, look.scale_map, range(k, k + 1))
+        draw(cells, range(cells.blocks))
+        device.finish()  # what still runs keeps its memory
+        cells = None  # room for the next

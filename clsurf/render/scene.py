@@ -87,3 +87,11 @@ def as_scene(thing) -> Scene:
     if isinstance(thing, Scene):
         return thing
     return Scene(thing if isinstance(thing, list | tuple) else [thing])
+
+
+def scene_origin(scene) -> NDArray:
+    """Return the world position (3,) float64 that the channel "position" is relative to: the first surface's zero."""
+    if not scene.surfaces:
+        return np.zeros(3)
+    surface, matrix = scene.placed[0]
+    return surface.origin.copy() if matrix is None else matrix[:3, :3] @ surface.origin + matrix[:3, 3]

@@ -34,7 +34,7 @@ def light_grid(device: Device, scratch: Scratch, grid: Grid, scene, camera, shad
     count = 0
     if shadowed:
         shadows = fresh_mask(device, scratch, casters, "shadows", bins, 1, own)
-        cast(device, scratch, grid, casters, own, np.inf, shadows, 1, 0)
+        cast(device, scratch, grid, casters, own, np.inf, shadows)
     if occluded:
         lights = sphere_lamps(shading.occlusion, camera)
         if lighting.sky is not None:
@@ -47,8 +47,7 @@ def light_grid(device: Device, scratch: Scratch, grid: Grid, scene, camera, shad
         reach = shading.occlusion_reach
         if reach is None:
             reach = REACH * float(np.linalg.norm(np.nan_to_num(scene.bounds[1] - scene.bounds[0], nan=np.inf)))
-        for word in range(count // 32):
-            cast(device, scratch, grid, casters, lights[32 * word:32 * word + 32], reach, hidden, count // 32, word)
+        cast(device, scratch, grid, casters, lights, reach, hidden)
     light_bins(device, scratch, grid, camera, lamps, lighting, shadows, shadowed, directions, hidden, count)
 
 

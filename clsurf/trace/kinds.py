@@ -1,7 +1,5 @@
 """What can be traced: each kind of surface registers how it is put on a device; rays know no more than `Traced`."""
 
-import threading
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -26,7 +24,7 @@ class Traced:
     unit : float
         Model length of one unit of the frame.
     box : (2, 3) float64
-        The surface lies inside; frame. Least above largest: nothing is hit.
+        The surface lies inside; frame. Least above largest: nothing is hit. Of a piece: where hits are looked for.
     launch : function
         ``launch(mode, count, rays, hits)`` enqueues the kernel that fills hits (count, 8) from rays (count, 8), both
         float32 and in the frame (kernels/trace/ray_walk.clh).
@@ -39,6 +37,8 @@ class Traced:
         Primitive of each slot of the packets' tree.
     colors : function, optional
         Linear colours (n, 3) float64 of primitives (n,), as `Hits.primitive` numbers them.
+    ready : function
+        ``ready()`` puts what only single rays need on the device, before the first of them.
     """
 
     center: NDArray
@@ -49,6 +49,7 @@ class Traced:
     packets: object | None = None
     order: DeviceArray | None = None
     colors: Callable[[NDArray], NDArray] | None = None
+    ready: Callable[[], None] = lambda: None
 
     def __post_init__(self):
         if self.grain is None or not np.isfinite(self.grain):
@@ -61,12 +62,44 @@ class Traced:
         return not (self.box[0] <= self.box[1]).all()
 
 
-KINDS: dict[type, Callable[[Device, object], Traced]] = {}
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A surface on the host, all or some of whose primitives go to a device; all of them share one frame.
+
+    Parameters
+    ----------
+    hold : function
+        ``hold(device, rows)`` puts the primitives `rows` (k,) int on the device, None: all, and returns `Traced`.
+    reaches : function
+        ``reaches()`` returns the boxes, low and high (n, 3) float64 of the frame, within which primitives count.
+    grain, colors
+        Those of the whole surface; see `Traced`.
+    radii : (n,) float64, optional
+        Of kinds whose hits blend what is around them: how far a primitive blends; frame.
+    blend : float
+        Largest radii beyond a hit within which others are blended that do not hold it.
+    same : float
+        Frame length within which hits of a ray in two pieces are one.
+    packets : bool
+        Whether packets trace it; see `Traced`.
+    """
+
+    hold: Callable[[Device, NDArray | None], Traced]
+    reaches: Callable[[], tuple[NDArray, NDArray]]
+    grain: float
+    colors: Callable[[NDArray], NDArray] | None = None
+    radii: NDArray | None = None
+    blend: float = 0.0
+    same: float = 0.0
+    packets: bool = False
+
+
+KINDS: dict[type, Callable[[object], Plan]] = {}
 NOTHING = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]])
 
 
 def register(kind: type):
-    """Make surfaces of `kind` traceable by the decorated function (device, surface) -> Traced."""
+    """Make surfaces of `kind` traceable by the decorated function (surface) -> Plan."""
     def enter(prepare):
         KINDS[kind] = prepare
         return prepare
@@ -78,23 +111,13 @@ def traceable(surface) -> bool:
     return any(kind in KINDS for kind in type(surface).__mro__)
 
 
-def items(device: Device, count: int) -> tuple[tuple, tuple, int]:
-    """Return global size, local size and rays of a work-item for `count` rays."""
-    batch = RAYS_OF_ITEM if device.lanes > 1 else 1
-    return (-(-count // batch),), (1 if device.lanes > 1 else 64,), batch
-
-
-_kept = threading.local()
-
-
-def traced(device: Device, surface) -> Traced:
-    """Return `surface` on the device; it stays there while the surface lives.
+def plan_of(surface) -> Plan:
+    """Return how a surface is put on a device.
 
     Raises
     ------
     InputError
         Something that cannot be traced.
-    DeviceMemoryError
     """
     prepare = next((KINDS[kind] for kind in type(surface).__mro__ if kind in KINDS), None)
     if prepare is None:
@@ -102,7 +125,10 @@ def traced(device: Device, surface) -> Traced:
         raise InputError(f"trace: expected one of {names}, plain or placed, or a scene or list of them, got "
                          f"{type(surface).__name__}: build a surface from a scan first (clsurf.build_slim, "
                          "clsurf.build_patches)")
-    uploads = _kept.__dict__.setdefault(id(device), weakref.WeakKeyDictionary())
-    if surface not in uploads:
-        uploads[surface] = prepare(device, surface)
-    return uploads[surface]
+    return prepare(surface)
+
+
+def items(device: Device, count: int) -> tuple[tuple, tuple, int]:
+    """Return global size, local size and rays of a work-item for `count` rays."""
+    batch = RAYS_OF_ITEM if device.lanes > 1 else 1
+    return (-(-count // batch),), (1 if device.lanes > 1 else 64,), batch

@@ -1,22 +1,24 @@
 """Scale maps for single rays: blocks of 4 x 4 cells of the net of texels. Kernel: kernels/trace/ray_scale_map.cl."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..device import Device
 from ..surface.cube import border_directions, bordered
 from ..surface.scale_map import ScaleMap
-from .kinds import NOTHING, Traced, items, register
-from .tree import node_boxes, plant
+from .kinds import NOTHING, Plan, Traced, items, register
+from .tree import WIDTH, node_boxes, plant, room
 
 SIDE = 4  # cells along a side of a block
 NODES = (SIDE + 1) ** 2
 BLOCK_FLOATS = 32  # face, first row and column of cells, then the 25 nodes' distances; kernels/trace/ray_scale_map.cl
+SAME = 2e-5  # radii: neighbouring cells both find a hit on their border; twice OVERLAP of the kernel
 SWELL = 1.02  # how far cells may bulge beyond the box of their nodes, over that box's own bulge
 
 
 @register(ScaleMap)
-def trace_scale_map(device: Device, surface: ScaleMap) -> Traced:
-    """Put the cells on the device, every layer; a hit's primitive is the texel at its cell's first corner.
+def plan_scale_map(surface: ScaleMap) -> Plan:
+    """Plan blocks of cells, every layer; a hit's primitive is the texel at its cell's first corner.
 
     The frame is in radii around the centre. Texels count layer by layer through `scales`; on a face's border, the
     nearest texel of the face.
@@ -41,24 +43,36 @@ def trace_scale_map(device: Device, surface: ScaleMap) -> Traced:
     whole = usable[:, 1:, 1:] & usable[:, :-1, 1:] & usable[:, 1:, :-1] & usable[:, :-1, :-1]
     kept = np.flatnonzero(whole.any(axis=(1, 2)))
     if not len(kept):
-        return Traced(surface.center, surface.radius, NOTHING, lambda *_: None)
+        nothing = Traced(surface.center, surface.radius, NOTHING, lambda *_: None)
+        return Plan(lambda *_: nothing, lambda: (np.zeros((0, 3)), np.zeros((0, 3))), nothing.grain)
     low, high = _boxes(points[kept], size, float(np.nanmax(heights)))
+    grid, row, column = kept // blocks_side**2, kept // blocks_side % blocks_side, kept % blocks_side
+    blocks = np.zeros((len(kept), BLOCK_FLOATS), np.float32)
+    blocks[:, 0], blocks[:, 1], blocks[:, 2], blocks[:, 3] = grid % 6, SIDE * row, SIDE * column, grid // 6
+    blocks[:, 4:4 + NODES] = np.nan_to_num(heights[kept], nan=-1)
+    box = np.stack([low.min(axis=0), high.max(axis=0)]) + 1e-4 * np.array([[-1.0], [1.0]])
+    center, radius = surface.center, surface.radius
+
+    def hold(device, rows):
+        some = slice(None) if rows is None else rows
+        return Traced(center, radius, box, hold_blocks(device, low[some], high[some], blocks[some], size))
+
+    return Plan(hold, lambda: (low, high), 2 * radius / size, same=SAME)
+
+
+def hold_blocks(device: Device, low: NDArray, high: NDArray, blocks: NDArray, size: int):
+    """Put blocks (n, 32) of cells with the boxes `low`, `high` (n, 3) on the device; return what launches rays."""
+    slots, nodes = room(len(blocks))
+    device.check_memory(blocks=4 * BLOCK_FLOATS * slots, nodes=24 * WIDTH * nodes)
     tree = plant(device, low, high)
-    number = np.arange(len(heights))
-    grid, row, column = number // blocks_side**2, number // blocks_side % blocks_side, number % blocks_side
-    rows = np.zeros((len(heights), BLOCK_FLOATS), np.float32)
-    rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = grid % 6, SIDE * row, SIDE * column, grid // 6
-    rows[:, 4:4 + NODES] = np.nan_to_num(heights, nan=-1)
-    arrays = [device.upload(node_boxes(tree, low, high)), device.upload(tree.in_slots(rows[kept], -1))]
+    arrays = [device.upload(node_boxes(tree, low, high)), device.upload(tree.in_slots(blocks, -1))]
 
     def launch(mode, count, rays, hits):
         group_size, group, batch = items(device, count)
         device.kernel("trace/ray_scale_map.cl", constants={"VW": device.lanes, "MODE": mode})(
             group_size, group, count, batch, size, tree.roots, tree.first_bottom, *arrays, rays, hits)
 
-    box = np.stack([low.min(axis=0), high.max(axis=0)])
-    return Traced(surface.center, surface.radius, box + 1e-4 * np.array([[-1.0], [1.0]]), launch,
-                  2 * surface.radius / surface.size)
+    return launch
 
 
 def _boxes(points, size, largest):

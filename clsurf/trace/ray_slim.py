@@ -1,43 +1,63 @@
 """SLIM surfaces for single rays: a record for each leaf. Kernel: kernels/trace/ray_slim.cl."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
+from ..io.stored_leaves import only
 from ..surface.slim import COEFFICIENTS, SlimSurface
 from ..surface.srgb import LINEAR_OF_BYTE
-from .kinds import NOTHING, Traced, items, register
-from .slim import TracedSlim, kept_traced
+from .kinds import NOTHING, Plan, Traced, items, register
+from .slim import TracedSlim, leaves_of, upload_traced
 from .tree import EMPTY, WIDTH, Tree
 
 FAR = 1e15  # where the ball of an empty slot lies
 
 
 @register(SlimSurface)
-def trace_slim(device: Device, surface: SlimSurface) -> Traced:
-    """Put the leaves on the device; the frame is the model's, relative to its origin. Shadows take packets alone."""
-    base = kept_traced(device, surface)
+def plan_slim(surface: SlimSurface) -> Plan:
+    """Plan the leaves; the frame is the model's, relative to its origin. Shadows take packets alone."""
+    leaves = np.flatnonzero(surface.leaf) if surface.leaf.any() else np.arange(len(surface))
+    own, origin, colors = replace(leaves_of(surface)), surface.origin, surface.colors  # not the surface itself
+
+    def hold(device, rows):
+        part, numbers = (own, leaves) if rows is None else (only(own, rows), leaves[rows])
+        return hold_slim(device, upload_traced(device, part), numbers, origin)
+
+    def reaches():
+        centers, radii = own.centers.astype(np.float64), own.radii.astype(np.float64)[:, None]
+        slack = 2e-6 * (radii + np.abs(centers))
+        return centers - radii - slack, centers + radii + slack
+
+    return Plan(hold, reaches, float(np.median(surface.radii[leaves])) if len(leaves) else 0.0,
+                None if colors is None else lambda primitives: LINEAR_OF_BYTE[colors[primitives, :3]],
+                radii=own.radii, same=2e-6 * surface.diagonal, packets=True)
+
+
+def hold_slim(device: Device, base: TracedSlim, numbers: NDArray, origin: NDArray) -> Traced:
+    """Return leaves on the device, numbered `numbers` (n,), for rays."""
     if not (base.tree.order >= 0).any():
-        return Traced(surface.origin, 1.0, NOTHING, lambda *_: None)
+        return Traced(origin, 1.0, NOTHING, lambda *_: None)
     top = device.download(base.boxes)[0]
     box = np.stack([top[:3].min(axis=1), top[3:].max(axis=1)]).astype(np.float64)
     margin = 1e-3 * float((box[1] - box[0]).max())
-    leaves = np.flatnonzero(surface.leaf) if surface.leaf.any() else np.arange(len(surface))  # what the tree holds
-    order = device.upload(np.where(base.tree.order >= 0, leaves[base.tree.order], -1).astype(np.int32))
+    order = device.upload(np.where(base.tree.order >= 0, numbers[base.tree.order], -1).astype(np.int32))
     for_rays: list[DeviceArray] = []  # from the first single ray on
 
-    def launch(mode, rays_count, rays, hits):
+    def ready():
         if not for_rays:
             for_rays.extend(single_arrays(device, base, order))
+
+    def launch(mode, rays_count, rays, hits):
+        ready()
         size, group, batch = items(device, rays_count)
         constants = {"VW": device.lanes, "DEGREE": base.degree, "ORIENTED": base.oriented, "MODE": mode}
         device.kernel("trace/ray_slim.cl", constants=constants)(
             size, group, rays_count, batch, base.tree.roots, base.tree.first_bottom, base.boxes, *for_rays, rays, hits)
 
-    colors = surface.colors
-    return Traced(surface.origin, 1.0, box + margin * np.array([[-1.0], [1.0]]), launch,
-                  float(np.median(surface.radii[leaves])), base, order,
-                  None if colors is None else lambda primitives: LINEAR_OF_BYTE[colors[primitives, :3]])
+    return Traced(origin, 1.0, box + margin * np.array([[-1.0], [1.0]]), launch, packets=base, order=order, ready=ready)
 
 
 def single_arrays(device: Device, base: TracedSlim, order: DeviceArray) -> list[DeviceArray]:
@@ -54,6 +74,7 @@ def single_arrays(device: Device, base: TracedSlim, order: DeviceArray) -> list[
     if count > 6:
         records[:, 16:20] = in_slots[:, 17:21]
     first, *near = neighbour_lists(tree, device.download(base.boxes), device.download(base.balls))
+    device.check_memory(records=records.nbytes, balls=balls.nbytes, boxes=near[0].nbytes)
     records, balls, first, *near = (device.upload(array) for array in (records, balls, first, *near))
     return [records, balls, order, first, *near]
 

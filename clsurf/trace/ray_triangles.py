@@ -12,8 +12,8 @@ from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
 from ..surface.srgb import LINEAR_OF_BYTE
-from .kinds import NOTHING, Traced, items, register
-from .tree import WIDTH, node_boxes, plant
+from .kinds import NOTHING, Plan, Traced, items, register
+from .tree import WIDTH, node_boxes, plant, room
 
 LARGEST_COUNT = 1 << 27
 MARGIN = 1e-6  # of boxes, frame units: more than the kernel's rounding, as coordinates are at most 1 or so
@@ -21,15 +21,15 @@ FAR = 3.0  # where the triangle of an empty slot lies: outside the frame's box, 
 
 
 @register(Mesh)
-def trace_mesh(device: Device, mesh: Mesh) -> Traced:
-    """Put the faces on the device."""
-    held = trace_triangles(device, mesh, None)
-    if held.empty:
-        return held
+def plan_mesh(mesh: Mesh) -> Plan:
+    """Plan the faces."""
+    plan = plan_triangles(mesh, None)
     some = mesh.faces[::max(len(mesh.faces) // 10000, 1)]
-    edges = np.linalg.norm(mesh.vertices[some[:, 0]].astype(np.float64) - mesh.vertices[some[:, 1]], axis=1)
-    grain = min(float(np.nanmedian(edges)) / 3, held.grain)  # faces of boxes are large, and near to each other
-    return replace(held, grain=grain, colors=mesh_colors(mesh.faces, mesh.colors))
+    with np.errstate(invalid="ignore"):
+        edges = np.linalg.norm(mesh.vertices[some[:, 0]].astype(np.float64) - mesh.vertices[some[:, 1]], axis=1)
+    edge = float(np.nanmedian(edges)) if np.isfinite(edges).any() else np.inf
+    grain = min(edge / 3, plan.grain)  # faces of boxes are large, and near to each other
+    return replace(plan, grain=grain, colors=mesh_colors(mesh.faces, mesh.colors))
 
 
 def mesh_colors(corners: NDArray, colors: NDArray | None):
@@ -38,16 +38,16 @@ def mesh_colors(corners: NDArray, colors: NDArray | None):
 
 
 @register(PatchSurface)
-def trace_patches(device: Device, surface: PatchSurface) -> Traced:
-    """Put two triangles for every opaque cell on the device; a hit's primitive is its patch."""
+def plan_patches(surface: PatchSurface) -> Plan:
+    """Plan two triangles for every opaque cell; a hit's primitive is its patch."""
     patch, i, j = surface.node_patches()
     m, n = surface.size[patch].T.astype(np.int64)
     first = np.flatnonzero((i < m - 1) & (j < n - 1))
     corners = np.stack([first, first + 1, first + m[first], first + m[first] + 1])
     whole = surface.opaque[corners].all(axis=0)
-    held = trace_triangles(device, patch_mesh(surface), np.tile(patch[first[whole]], 2))
+    plan = plan_triangles(patch_mesh(surface), np.tile(patch[first[whole]], 2))
     spacing = np.linalg.norm(surface.axis_x, axis=1)
-    return replace(held, grain=float(np.median(spacing)) if len(spacing) else 0.0,
+    return replace(plan, grain=float(np.median(spacing)) if len(spacing) else 0.0,
                    colors=patch_colors(surface.colors, surface.color, surface.node_offset))
 
 
@@ -63,31 +63,22 @@ def patch_colors(colors: NDArray | None, color, node_offset: NDArray):
     return means
 
 
-def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Traced:
-    """Put faces on the device, in a frame around the middle of the used vertices in which the longest side is 1/2 to 1.
+def plan_triangles(mesh: Mesh, numbers: NDArray | None) -> Plan:
+    """Plan faces, in a frame around the middle of the used vertices in which the longest side is 1/2 to 1.
 
     Parameters
     ----------
     numbers : (f,) int, optional
         What a hit's primitive is; by default the face. Faces with a vertex that is not finite are left out.
-
-    Raises
-    ------
-    InputError
-        More faces than a slot's number holds.
-    DeviceMemoryError
     """
-    if len(mesh.faces) > LARGEST_COUNT:
-        raise InputError(f"mesh: expected at most {LARGEST_COUNT:,} faces to trace, got {len(mesh.faces):,}: split it")
-    bottoms = 16 * -(-len(mesh.faces) // WIDTH) / 15
-    device.check_memory(triangles=int(bottoms * 36 * WIDTH), nodes=int(bottoms * 24 * WIDTH / 15))
     finite = np.isfinite(mesh.vertices)
     kept = np.arange(len(mesh.faces))
     if not finite.all():
         whole = finite.all(axis=1)[mesh.faces]
         kept = np.flatnonzero(whole.all(axis=1))
     if not len(kept):
-        return Traced(mesh.origin, 1.0, NOTHING, lambda *_: None)
+        nothing = Traced(mesh.origin, 1.0, NOTHING, lambda *_: None)
+        return Plan(lambda *_: nothing, lambda: (np.zeros((0, 3)), np.zeros((0, 3))), nothing.grain)
     faces = mesh.faces[kept]
     used = np.zeros(len(mesh.vertices), bool)
     used[faces.ravel()] = True
@@ -96,19 +87,42 @@ def trace_triangles(device: Device, mesh: Mesh, numbers: NDArray | None) -> Trac
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else max(float(np.abs(middle).max()), 1.0)
     corners = ((mesh.vertices.astype(np.float64) - middle) / unit).astype(np.float32)[faces]
+    order = (kept if numbers is None else numbers[kept]).astype(np.int32)
+    half, center = (high - low) / 2 / unit + 1e-3, mesh.origin + middle
+    frame = Traced(center, unit, np.stack([-half, half]), lambda *_: None)
+
+    def hold(device, rows):
+        some = slice(None) if rows is None else rows
+        return replace(frame, launch=hold_triangles(device, corners[some], order[some]))
+
+    return Plan(hold, lambda: (corners.min(axis=1).astype(np.float64), corners.max(axis=1).astype(np.float64)),
+                frame.grain)
+
+
+def hold_triangles(device: Device, corners: NDArray, order: NDArray):
+    """Put triangles (f, 3, 3) of a frame, numbered `order` (f,), on the device; return what launches rays.
+
+    Raises
+    ------
+    InputError
+        More faces than a slot's number holds.
+    DeviceMemoryError
+    """
+    if len(order) > LARGEST_COUNT:
+        raise InputError(f"mesh: expected at most {LARGEST_COUNT:,} faces to trace, got {len(order):,}: split it")
+    slots, nodes = room(len(order))
+    device.check_memory(triangles=36 * slots, nodes=24 * WIDTH * nodes, numbers=4 * slots)
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     below = np.minimum(np.minimum(a, b), c) - np.float32(MARGIN)
     above = np.maximum(np.maximum(a, b), c) + np.float32(MARGIN)
     tree = plant(device, below, above)
     blocks = tree.in_slots(corners.reshape(-1, 9), FAR).reshape(-1, WIDTH, 9).transpose(0, 2, 1)
-    order = kept if numbers is None else numbers[kept]
     arrays = [device.upload(node_boxes(tree, below, above)), device.upload(np.ascontiguousarray(blocks)),
-              device.upload(tree.in_slots(order.astype(np.int32), -1))]
+              device.upload(tree.in_slots(order, -1))]
 
     def launch(mode, count, rays, hits):
         size, group, batch = items(device, count)
         device.kernel("trace/ray_triangles.cl", constants={"VW": device.lanes, "MODE": mode})(
             size, group, count, batch, tree.roots, tree.first_bottom, *arrays, rays, hits)
 
-    half = (high - low) / 2 / unit + 1e-3
-    return Traced(mesh.origin + middle, unit, np.stack([-half, half]), launch)
+    return launch

@@ -3,19 +3,18 @@
 Kernels: kernels/trace/packet.clh. Source of the surface: Ohtake, Belyaev, Alexa, SGP 2005, section 2.
 """
 
-import threading
-import weakref
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from ..io.stored_leaves import only
 from ..surface.slim import SlimSurface
 from ..surface.slim_bounds import height_bounds, scaled_coefficients
 from ..surface.srgb import LINEAR_OF_BYTE
-from .tree import WIDTH, Tree, node_boxes, plant
+from .tree import WIDTH, Tree, node_boxes, plant, room
 
 ALPHA = 0.8  # hits lie in balls shrunken by this, as in the renderer
 SURFEL_FLOATS = 21  # vectors of 16 of a bottom node; the planes of kernels/common/select_slim.clh
@@ -71,10 +70,13 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
         More surfels than a slot's number holds.
     DeviceMemoryError
     """
-    surface = _leaves(surface)
+    surface = leaves_of(surface)
     n = len(surface)
     if n > 1 << 27:
         raise InputError(f"surface: expected at most {1 << 27:,} surfels to trace, got {n:,}: split it")
+    slots, nodes = room(n)
+    device.check_memory(surfels=4 * SURFEL_FLOATS * slots, tails=4 * TAIL_FLOATS * slots, boxes=24 * WIDTH * nodes,
+                        balls=24 * WIDTH * nodes, colors=0 if surface.colors is None else 16 * slots)
     degree, radii = surface.degree, surface.radii.astype(np.float64)
     with np.errstate(all="ignore"):
         k = scaled_coefficients(degree, surface.coefficients, surface.radii)
@@ -106,7 +108,6 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
     if surface.colors is not None:
         colors = np.ones((len(tree.order), 4), np.float32)
         colors[used, :3] = LINEAR_OF_BYTE[surface.colors[at, :3]]
-    device.check_memory(surfels=4 * planes.size + tails.nbytes, nodes=4 * 12 * WIDTH * tree.node_count)
     points = centers[at]
     center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
     boxes, balls = node_boxes(tree, below, above), node_boxes(tree, centers - reach, centers + reach)
@@ -117,24 +118,8 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
         float((np.linalg.norm(points - center, axis=1) + radii[at]).max()) if len(points) else 0.0)
 
 
-_kept = threading.local()
-
-
-def kept_traced(device: Device, surface: SlimSurface) -> TracedSlim:
-    """Return `upload_traced` of a surface, made on this thread's first use and kept while the surface lives."""
-    uploads = _kept.__dict__.setdefault(id(device), weakref.WeakKeyDictionary())
-    if surface not in uploads:
-        uploads[surface] = upload_traced(device, surface)
-    return uploads[surface]
-
-
-def _leaves(surface: SlimSurface) -> SlimSurface:
+def leaves_of(surface: SlimSurface) -> SlimSurface:
     """Return the leaves alone; a surface without leaves as it is."""
     if surface.leaf.all() or not surface.leaf.any():
         return surface
-    keep = np.flatnonzero(surface.leaf)
-    take = lambda array: None if array is None else array[keep]  # noqa: E731
-    return replace(surface, centers=take(surface.centers), radii=take(surface.radii), normals=take(surface.normals),
-                   coefficients=take(surface.coefficients), level=take(surface.level), leaf=np.ones(len(keep), bool),
-                   child_offset=np.zeros(len(keep) + 1, np.int32), children=np.zeros(0, np.int32),
-                   fit_error=take(surface.fit_error), footprint=take(surface.footprint), colors=take(surface.colors))
+    return only(surface, np.flatnonzero(surface.leaf))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..io.stored import StoredSurface
 from ..io.stored_leaves import StoredLeaves
 from ..surface.placed import Placed
+from .rays import Hits
 
 DEEPEST = 40  # cuts of a box: what does not fit then is read all the same
 SLACK = 1e-6  # of the diagonal: what rounds to the other side of a cut is found on both
@@ -48,7 +49,7 @@ def trace_stored(stored: StoredSurface, matrix: NDArray | None, rays, query: str
 
     Primitives are numbered through the parts in their order.
     """
-    from .hits import Hits, trace
+    from .hits import trace
     way = _way(rays, matrix)
     leaves: StoredLeaves = stored.leaves()
     n, slack = rays.count, SLACK * stored.diagonal * way.scale
@@ -133,7 +134,6 @@ def _halves(box: NDArray, along: NDArray) -> list[NDArray]:
 
 def _sorted(every: list[tuple], count: int, same: float):
     """Return all hits in the order of the rays, those found on both sides of a cut once."""
-    from .hits import Hits
     empty = (np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64))
     ray, distance, position, normal, primitive = (np.concatenate(parts) for parts in zip(empty, *every, strict=True))
     order = np.lexsort((distance, primitive, ray))

@@ -79,10 +79,7 @@ def plant(device: Device, low: NDArray, high: NDArray) -> Tree:
         order = np.full(WIDTH, -1, np.int32)
         order[:len(used)] = used
         return Tree(0, 1, 0, order)
-    full = 1  # bottom nodes below one root
-    while WIDTH * full < bottoms:
-        full *= WIDTH
-    roots = -(-bottoms // full)
+    roots, full = _shape(bottoms)
     if len(used) < len(low):
         low, high = low[used], high[used]
     order, count = _split(device, low, high, roots, full)
@@ -91,6 +88,23 @@ def plant(device: Device, low: NDArray, high: NDArray) -> Tree:
     slots[there] = used[order]
     first = 1 + roots * ((full - 1) // (WIDTH - 1))
     return Tree(roots, first + roots * full, first, slots.ravel())
+
+
+def room(count: int) -> tuple[int, int]:
+    """Return how many slots and nodes the tree of `count` primitives has at most."""
+    bottoms = max(-(-count // WIDTH), 1)
+    if bottoms == 1:
+        return WIDTH, 1
+    roots, full = _shape(bottoms)
+    return WIDTH * roots * full, 1 + roots * ((WIDTH * full - 1) // (WIDTH - 1))
+
+
+def _shape(bottoms: int) -> tuple[int, int]:
+    """Return the children of node 0, and the bottom nodes below each of them."""
+    full = 1
+    while WIDTH * full < bottoms:
+        full *= WIDTH
+    return -(-bottoms // full), full
 
 
 def _split(device: Device, low: NDArray, high: NDArray, roots: int, full: int) -> tuple[NDArray, NDArray]:

@@ -83,12 +83,13 @@ INLINE void put_cells(Projected *k, int part, float cx, float cy, int perspectiv
 }
 
 __kernel void project_cells(__global const float *view, __global const float *positions, int stride, int side,
-                            int blocks_side, int blocks, __global float *records, __global short4 *full,
-                            __global short4 *core, __global uint *keys, __global ushort *buckets) {
-  int block = get_global_id(0);
+                            int blocks_side, int first_block, int blocks /* from there on */,
+                            __global float *records, __global short4 *full, __global short4 *core,
+                            __global uint *keys, __global ushort *buckets) {
+  int block = get_global_id(0), number = first_block + block;
   if (block >= blocks) return;
-  int grid = block / (blocks_side * blocks_side), row0 = block / blocks_side % blocks_side * BLOCK_SIDE;
-  int column0 = block % blocks_side * BLOCK_SIDE;
+  int grid = number / (blocks_side * blocks_side), row0 = number / blocks_side % blocks_side * BLOCK_SIDE;
+  int column0 = number % blocks_side * BLOCK_SIDE;
   int base = (grid * side + row0) * side + column0;
   int rows = side - 1 - row0, columns = side - 1 - column0;  // of cells from here on
   const int perspective = view[PERSPECTIVE] > 0.0f;

@@ -81,8 +81,8 @@ INLINE void start_pixels(__global const float *view, VF px, VF py, VF before, Pi
 
 __kernel void tile_cells(__global const float *view, __global const uint2 *pairs, __global const uint *offsets,
                          __global const float *records, __global const float4 *nodes, int side, int grid_nodes,
-                         int surface, int tiles_x, int tile_count, int bins_x, int bins_y, __global int *touched,
-                         __global float *tile_planes) {
+                         int first_layer, int surface, int tiles_x, int tile_count, int bins_x, int bins_y,
+                         __global int *touched, __global float *tile_planes) {
 #if VW == 1
   int tile = get_group_id(0), pixel = get_local_id(0);
 #else
@@ -121,7 +121,7 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
           draw_cell(record, cell, base + (cell >> 2) * side + (cell & 3), x, y, nearest, &here);
       }
     }
-    show_pixels(view, nodes, side, grid_nodes, surface, &here, before, px, py, planes, pixel);
+    show_pixels(view, nodes, side, grid_nodes, first_layer, surface, &here, before, px, py, planes, pixel);
     barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     if (pixel == 0) touched[bin] = (was_touched ? touched[bin] : 0) + tests;
 #else
@@ -169,7 +169,8 @@ __kernel void tile_cells(__global const float *view, __global const uint2 *pairs
       int q = b / (16 / VW), qx = (q & 1) * 4, qy = (q >> 1) * 4 + b % (16 / VW) * (VW / 4);
       VF px = TO_VF(LANE_INDEX & 3) + (qx - 3.5f), py = TO_VF(LANE_INDEX >> 2) + (qy - 3.5f);
       BEFORE(qy * BIN + qx)
-      show_pixels(view, nodes, side, grid_nodes, surface, &all[b], before, px + bx, py + by, planes, qy * BIN + qx);
+      show_pixels(view, nodes, side, grid_nodes, first_layer, surface, &all[b], before, px + bx, py + by, planes,
+                  qy * BIN + qx);
     }
     touched[bin] = (was_touched ? touched[bin] : 0) + tests;
 #endif

@@ -14,6 +14,10 @@ enum { D_X, D_Y, D_Z, D_NX, D_NY, D_NZ, D_RADIUS, FIELDS };
 #define SLAB 0.3f
 #define LEAN 0.25f
 
+#ifndef PIECES
+#define PIECES 0  // 1: the discs are some of a surface's; hits that count only before a disc seen from behind say so
+#endif
+
 // What a walk looks for: the frontmost disc, only its side where that lies past the ray's end, or the blend.
 enum { FRONTMOST, PAST_END, BLENDED };
 typedef struct { float low, hit, face; int aim; } Goal;
@@ -92,7 +96,11 @@ __kernel void ray_surfels(int count, int batch, int roots, int first_bottom, flo
     found.whole = INFINITY; found.slot = found.whole_slot = -1;
     found.t = found.face = found.weight = found.depth = found.x = found.y = found.z = 0.0f;
     walk_one(&way, &goal, blocks, roots, first_bottom, boxes, &found);
-    if (found.slot < 0 && found.whole < INFINITY) {  // a gap if the disc past the end is seen from behind
+    int waits = 0;  // for what other pieces have behind
+    if (PIECES && MODE != ANY) {
+      waits = found.slot < 0 && found.whole < INFINITY;
+      if (waits) { found.slot = found.whole_slot; found.t = found.whole; found.face = 1.0f; }
+    } else if (found.slot < 0 && found.whole < INFINITY) {  // a gap if the disc past the end is seen from behind
       way.far = FARTHEST; found.key = INFINITY; goal.aim = PAST_END;
       walk_one(&way, &goal, blocks, roots, first_bottom, boxes, &found);
     }
@@ -119,7 +127,7 @@ __kernel void ray_surfels(int count, int batch, int roots, int first_bottom, flo
     out[HIT_NORMAL] = found.face * found.x; out[HIT_NORMAL + 1] = found.face * found.y;
     out[HIT_NORMAL + 2] = found.face * found.z;
     out[HIT_PRIMITIVE] = as_float(order[slot]);
-    out[HIT_SIDE] = found.face;
+    out[HIT_SIDE] = waits ? 3.0f : found.face;
     out[HIT_LOW] = found.last > t ? found.last : t; out[HIT_STATE] = 0.0f;
   }
 }

@@ -24,6 +24,18 @@ def sphere_mesh(rings=24, segments=48, radius=1.0):
     return Mesh(points.astype(np.float32), np.array(faces))
 
 
+def torus_mesh(around=240, across=120):
+    """A closed torus of radii 2 and 1."""
+    u, v = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(across) * 2 * np.pi / across, indexing="ij")
+    points = np.stack([(2 + np.cos(v)) * np.cos(u), (2 + np.cos(v)) * np.sin(u), np.sin(v)], axis=-1).reshape(-1, 3)
+    at = np.arange(around * across).reshape(around, across)
+    right, down = np.roll(at, -1, axis=0), np.roll(at, -1, axis=1)
+    both = np.roll(right, -1, axis=1)
+    faces = np.concatenate([np.stack([at, right, both], -1).reshape(-1, 3),
+                            np.stack([at, both, down], -1).reshape(-1, 3)])
+    return Mesh(points, faces.astype(np.int32))
+
+
 def random_rays(count, seed=0, radius=2.0, inside=0.9):
     """Rays from outside a ball of 1 toward random points of it."""
     rng = np.random.default_rng(seed)
