@@ -46,7 +46,8 @@ class Hits:
     position : (n, 3) float64
         NaN: missed.
     normal : (n, 3) float64
-        Unit, toward the side that the ray comes from; NaN: missed.
+        Unit, toward the side that the ray comes from; NaN: missed. Of meshes, patches and hybrid hierarchies the
+        triangle's own, which the renderer's smooth normals are near to.
     surface : (n,) int32
         Number of the surface in the scene or list, 0 for a single surface; -1: missed.
     primitive : (n,) int32
@@ -90,10 +91,12 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
         World space, float64; broadcast against each other. Directions need not be unit; a ray whose direction is zero
         or whose numbers are not finite misses.
     query : str
-        "closest"; "any": some hit, not always the nearest, and not blended, which is faster; "all".
+        "closest"; "any": some hit, not always the nearest, and not blended, which is faster; "all": where spatial
+        patches overlap, each of them is hit.
     near, far : float or (...) array_like
         Hits are looked for between these distances (world units), `near` itself left out: for rays that start on the
-        surface.
+        surface. Rays that start at a hit of SLIM surfels, discs or patches meet their neighbours there: start them
+        1/20 of a median radius (of patches: of a node's spacing) up `Hits.normal`, with `near` half of it.
     device : None, str or Device
     progress : function, optional
         ``progress(stage, share done)``; False stops the work.
