@@ -284,7 +284,9 @@ def test_tolerance_of_fits(tree, sorted_points, tolerance, lanes):
     assert np.allclose(record[disc, 1:4], sorted_points[1][centers[disc]], atol=1e-5)
 
 
-def test_neighbor_spread(tree, sorted_points):
+@pytest.mark.parametrize("turns", (None, 65535), ids=("on_the_device", "on_the_host"))
+def test_neighbor_spread(tree, sorted_points, turns, monkeypatch):
+    monkeypatch.setattr(tree.device, "loop_turns", turns)
     points = sorted_points[0]
     noise = radius.measure_noise(tree)
     pairs = np.array([twin.neighbor_spread(points, i) for i in range(tree.count)])

@@ -225,6 +225,7 @@ def test_damaged_colmap_files_are_one_line(tmp_path, ending):
             data = bytearray(whole)
             data[rng.integers(len(data))] = rng.integers(256)
             broken.append(bytes(data))
+        broken.append(whole.replace(b"b.png\0", b"\n.png\0\xff\xff\xff\xff"))  # two lines, too many points
         failed = 0
         for data in broken:
             (tmp_path / name).write_bytes(data)

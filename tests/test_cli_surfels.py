@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 from test_build_surfels import uv_sphere
 
 import clsurf
@@ -66,6 +67,22 @@ def test_render_trace_report_convert(files):
     assert abs(np.median(np.load(files / "k.npz")["mean"]) - 1) < 0.05
 
 
+def test_relief_draws_as_the_option_of_the_same_name(files):
+    points = sphere(1500).points
+    bumps = 1 + 0.1 * np.sin(14 * points).prod(axis=1, keepdims=True)
+    clsurf.save(clsurf.build_surfels(clsurf.PointCloud(points * bumps)), files / "bumpy.clsurf")
+    surface, relief = clsurf.load(files / "bumpy.clsurf"), {"0": 0.0, "0.75": 0.75, "inf": np.inf}
+    drawn = {}
+    for given, value in relief.items():
+        run("render", files / "bumpy.clsurf", files / "r.png", "--size", "80x60", "--lod", "12", "--relief", given)
+        drawn[given] = np.asarray(Image.open(files / "r.png"))
+        clsurf.render(surface, clsurf.Camera.framing(surface, aspect=4 / 3), (80, 60), lod=12,
+                      surfels=clsurf.SurfelDrawing(relief=value)).save(files / "same.png")
+        np.testing.assert_array_equal(drawn[given], np.asarray(Image.open(files / "same.png")))
+    assert (drawn["0"] != drawn["inf"]).any()
+    run("report", files / "pure.clsurf", "--out", files / "relief.html", "--size", "40x40", "--relief", "inf")
+
+
 @pytest.mark.parametrize(("options", "message"), [
     (dict(kind="slim", map_size=8), "--map-size: an option of --kind surfels"),
     (dict(kind="patches", hybrid=True), "--hybrid: an option of --kind surfels"),
@@ -84,6 +101,8 @@ def test_mistakes_end_in_one_line(files, capsys):
     for arguments, says in ((("build", files / "cloud.ply", files / "x.clsurf", "--hybrid"), "hybrid: expected a mesh"),
                             (("build", files / "cloud.ply", files / "x.slim2t", "--kind", "surfels"), "a name that"),
                             (("render", files / "pure.clsurf", files / "x.png", "--interior", "-3"), "interior"),
+                            (("render", files / "pure.clsurf", files / "x.png", "--relief", "-1"), "relief"),
+                            (("report", files / "pure.clsurf", "--relief", "nan"), "relief"),
                             (("report", files / "mesh.ply", "--texels", "9"), "--texels: an option of --kind"),
                             (("report", files / "mesh.ply", "--stored-normals"), "--stored-normals: an option of")):
         capsys.readouterr()

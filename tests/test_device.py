@@ -13,7 +13,9 @@ import pytest
 
 from clsurf.device import Profile, all_devices, choose_device, icd, open_device, pocl_target, sources
 from clsurf.device.arrays import HUGE, HostPool, _size_class
+from clsurf.device.context import Device
 from clsurf.device.doctor import check, examine
+from clsurf.device.sources import number_of
 from clsurf.errors import DeviceError, DeviceMemoryError, KernelBuildError
 
 
@@ -119,6 +121,21 @@ def test_items_asked_for_one_by_one_run_in_groups(device, count, monkeypatch):
     got = device.download(target)
     np.testing.assert_allclose(got[:count], 2 * np.sqrt(np.arange(count)) + 1, rtol=1e-6)
     assert (got[count:] == -1).all() and ((8,) in sizes) == (count >= 8)
+
+
+def test_drivers_that_end_long_loops(device):
+    """Groups are filled up, with items that do nothing; a loop that was cut off is an error at the download."""
+    other = Device(device.cl_device)
+    other.loop_turns, other.ended, other.group_items = 65535, other.upload(np.zeros(2, np.int32)), 8
+    given, target = np.arange(64, dtype=np.float32), other.upload(np.full(64, -1, np.float32))
+    whole, part = device.empty(64, np.float32), other.kernel("common/self_test.cl", constants={"VW": 1})
+    device.kernel("common/self_test.cl", constants={"VW": 1})((64,), (1,), device.upload(given), whole, 2.0)
+    part((61,), (1,), other.upload(given), target, 2.0)
+    assert (other.download(target) == np.append(device.download(whole)[:61], 3 * [-1.0])).all()
+    other.write(other.ended, np.array([0, number_of("self_test")], np.int32))
+    with pytest.raises(DeviceError, match="ends loops after 65,535 turns, too few for self_test"):
+        other.download(target)
+    assert (other.download(target)[61:] == -1).all()
 
 
 @pytest.mark.parametrize("lanes", [16, 8, 4, 1])

@@ -7,6 +7,7 @@ from reference.ray_scenes import torus_mesh
 from reference.small_device import small
 
 import clsurf
+from clsurf.build.triangles import barycentric_foot
 from clsurf.errors import InputError
 from clsurf.models import perfect_sphere
 from clsurf.surface.mesh import Mesh
@@ -95,3 +96,36 @@ def test_triangles_larger_than_a_device_are_looked_through_in_parts(device):
         # Where two faces are as near, either may be taken.
         assert (np.abs(got.position - wanted.position).max(axis=1) < 1e-5).mean() > 0.99
         assert (np.abs(got.normal - wanted.normal).max(axis=1) < 1e-3).mean() > 0.99
+
+
+@pytest.mark.parametrize("edge", [1e-7, 3e-4, 1.0, 1e5])
+def test_feet_do_not_depend_on_the_unit(device, edge):
+    """Scans in metres have edges of a tenth of a millimetre: their feet lie in faces, not on edges."""
+    i, j = np.meshgrid(np.arange(24), np.arange(24), indexing="ij")
+    grid = np.stack([i, j, 0 * i], axis=-1).reshape(-1, 3)
+    a = (np.arange(23)[:, None] * 24 + np.arange(23)).ravel()
+    faces = np.concatenate([np.stack([a, a + 24, a + 25], axis=1), np.stack([a, a + 25, a + 1], axis=1)])
+    points = np.random.default_rng(2).uniform([0, 0, -3], [23, 23, 3], (3000, 3))
+    found = clsurf.project(Mesh(grid * edge, faces), points * edge, device)
+    # Near an edge of two faces either is taken: the foot is off by the root of float32's step.
+    assert np.abs(found.position / edge - points * [1, 1, 0]).max() < 2e-3
+    assert np.abs(found.distance / edge - points[:, 2]).max() < 1e-5
+
+
+def test_feet_on_needles_and_faces_without_area():
+    """The foot is never further than the nearest of a dense sample of the face."""
+    rng = np.random.default_rng(3)
+    corners = rng.normal(size=(400, 3, 3))
+    corners[:100, 2] = corners[:100, 0] + rng.uniform(-1, 2, (100, 1)) * (corners[:100, 1] - corners[:100, 0])
+    corners[100:150, 1] = corners[100:150, 0]
+    corners[150:170] = corners[150:170, :1]
+    corners[170:200, 2] += 1e-9 * (corners[170:200, 2] - corners[170:200, 1])
+    points = rng.normal(size=(400, 3)) * 1.5
+    foot, weights = barycentric_foot(points, corners)
+    s, t = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 60), np.linspace(0, 1, 60)))
+    some = np.stack([1 - s, s * (1 - t), s * t], axis=1)
+    nearest = np.linalg.norm(np.einsum("si,nij->nsj", some, corners) - points[:, None], axis=2).min(axis=1)
+    away = np.linalg.norm(foot - points, axis=1)
+    assert (away <= nearest + 1e-9).all() and (away > nearest - 0.1).all()
+    assert (weights >= 0).all() and np.allclose(weights.sum(axis=1), 1)
+    assert np.allclose(np.einsum("ni,nij->nj", weights, corners), foot)

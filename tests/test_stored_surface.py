@@ -216,6 +216,8 @@ def test_counts_and_chunks_that_do_not_fit_are_refused(place, tmp_path):
     refused(copy, "expected the shape")
     with served(copy) as address:
         refused(address, "damaged")
+    index["surfels"][1, 0] = -5
+    refused(copy, "expected counts")
     shutil.rmtree(copy)
     shutil.copytree(place, copy)
     (copy / "parts/00001/centers/c/0/0").unlink()

@@ -74,8 +74,23 @@ def test_equal_points_and_large_coordinates(device):
     assert np.array_equal(np.sort(tree.order[tree.order >= 0]), np.arange(1000))
 
 
+@pytest.mark.parametrize("count", COUNTS)
+def test_drivers_that_end_long_loops_get_trees_too(device, count, monkeypatch):
+    """The first rounds are made here; what follows on the device has short loops."""
+    low, high = boxes(count)
+    usual = plant(device, low, high)
+    monkeypatch.setattr(device, "loop_turns", 16 * 100)
+    tree = plant(device, low, high)
+    assert np.array_equal(np.sort(tree.order[tree.order >= 0]), np.arange(count))
+    assert (tree.roots, tree.node_count, tree.first_bottom) == (usual.roots, usual.node_count, usual.first_bottom)
+    box, other = node_boxes(tree, low, high)[tree.first_bottom:], node_boxes(usual, low, high)[tree.first_bottom:]
+    area = [np.prod(np.maximum(b[:, 3:].max(axis=2) - b[:, :3].min(axis=2), 0), axis=1).sum() for b in (box, other)]
+    assert area[0] < 2 * area[1] + 1e-6
+
+
 @pytest.mark.parametrize("count", [300, 1500, 5000])
-def test_split_nodes(device, count):
+def test_split_nodes(device, count, monkeypatch):
+    monkeypatch.setattr(device, "loop_turns", None)  # all rounds on the device
     low, high = (np.round(1024 * side) / 1024 for side in boxes(count, seed=count))
     low[:, 0], high[:, 0] = low[:, 0] + 0.01 * np.arange(count), high[:, 0] + 0.01 * np.arange(count)  # no equal keys
     tree = plant(device, low, high)

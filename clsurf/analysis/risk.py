@@ -13,6 +13,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from ..build.point_tree import BLOCK, PointTree, lane_form
+from ..build.radius import neighbour_spreads
 
 SAMPLES = (1000, 8000)  # least and most, where there are so many points
 POINTS_PER_SAMPLE = 48
@@ -87,12 +88,8 @@ def local_spacings(tree: PointTree, blocks: NDArray) -> NDArray:
     neighbors = min(10, tree.count - 1)
     if neighbors < 3:
         return np.ones(len(blocks))
-    device = tree.device
-    spread, furthest2 = (device.empty((len(blocks), BLOCK), np.float32) for _ in range(2))
-    device.kernel("build/neighbor_spread.cl", constants={"NEIGHBORS": neighbors})(
-        (len(blocks),), (1,), len(blocks), device.upload(blocks), *tree.arguments, 2.0 / np.sqrt(tree.count), spread,
-        furthest2)
-    far2 = np.where(device.download(spread, copy=False) >= 0, device.download(furthest2, copy=False), np.nan)
+    spread, furthest2 = neighbour_spreads(tree, blocks)
+    far2 = np.where(spread >= 0, furthest2, np.nan)
     spacing = np.sqrt(np.nanmedian(far2.astype(np.float64), axis=1) * np.pi / (neighbors + 0.5))
     typical = np.median(spacing)
     # Strays have no spacing of their own; copies of one point have none either.

@@ -6,12 +6,12 @@ TVCG 11(3), 2005: right at edges and vertices too, where the nearest face alone 
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.triangles import angles, closest_point
+from trimesh.triangles import angles
 
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
 from ..surface.mesh import Mesh
-from .triangles import nearest_triangles
+from .triangles import barycentric_foot, nearest_triangles
 
 ON_EDGE = 1e-6  # share of a corner below which a foot lies on the opposite edge
 
@@ -25,18 +25,11 @@ def project_mesh(mesh: Mesh, points: NDArray, device: Device) -> tuple[NDArray, 
     _, face = nearest_triangles(mesh.vertices, mesh.faces, local, device)
     vertices = mesh.vertices.astype(np.float64)
     corners = vertices[mesh.faces[face]]
-    foot = closest_point(corners, local)
-    normal = _pseudonormals(vertices, np.asarray(mesh.faces, np.int64), face, _weights(foot, corners))
+    foot, weights = barycentric_foot(local, corners)
+    normal = _pseudonormals(vertices, np.asarray(mesh.faces, np.int64), face, weights)
     apart = local - foot
     side = np.where(np.einsum("ij,ij->i", apart, normal) < 0, -1.0, 1.0)
     return foot + mesh.origin, normal, side * np.linalg.norm(apart, axis=1)
-
-
-def _weights(foot: NDArray, corners: NDArray) -> NDArray:
-    """Return the barycentric weights (n, 3) of points in triangles (n, 3 corners, 3)."""
-    parts = [np.cross(corners[:, (k + 1) % 3] - foot, corners[:, (k + 2) % 3] - foot) for k in range(3)]
-    area = np.linalg.norm(np.stack(parts, axis=1), axis=2)
-    return area / np.maximum(area.sum(axis=1, keepdims=True), 1e-300)
 
 
 def _pseudonormals(vertices, faces, face, weights) -> NDArray:

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.triangles import closest_point
 
 from ..device import Device
 from ..errors import InputError
@@ -10,7 +9,7 @@ from ..surface.cube import interpolated
 from ..surface.scale_map import ScaleMap
 from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import frame_of_normals
-from .triangles import nearest_triangles
+from .triangles import barycentric_foot, nearest_triangles
 
 
 def project_scale_map(surface: ScaleMap, points: NDArray, device: Device) -> tuple[NDArray, NDArray, NDArray]:
@@ -25,7 +24,7 @@ def project_scale_map(surface: ScaleMap, points: NDArray, device: Device) -> tup
     local = points - surface.center
     _, face = nearest_triangles(mesh.vertices, mesh.faces, local, device)
     corners = mesh.vertices.astype(np.float64)[mesh.faces[face]]
-    foot = closest_point(corners, local)
+    foot, _ = barycentric_foot(local, corners)
     length = np.linalg.norm(foot, axis=1, keepdims=True)
     direction = foot / np.where(length > 0, length, 1)
     direction[length[:, 0] == 0] = (0, 0, 1)

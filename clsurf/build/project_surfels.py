@@ -7,7 +7,7 @@ from ..device import Device
 from ..errors import InputError
 from ..surface.surfel import SurfelHierarchy
 from .neighbours import nearest
-from .triangles import nearest_triangles
+from .triangles import barycentric_foot, nearest_triangles
 
 NEIGHBOURS = 12  # base surfels that are blended
 STEPS = 4  # onto the blend, each about a tenth of the way left by the one before
@@ -75,29 +75,8 @@ def on_triangles(surface: SurfelHierarchy, points: NDArray, device: Device) -> N
     """Return (n, 7): position, interpolated normal, signed distance; see `on_discs`."""
     _, face = nearest_triangles(surface.vertices, surface.triangles, points, device)
     index = surface.triangles[face]
-    a, b, c = (surface.vertices[index[:, k]].astype(np.float64) for k in range(3))
-    weights = barycentric_foot(points, a, b, c)
-    q = (weights[:, :, None] * np.stack([a, b, c], axis=1)).sum(axis=1)
+    q, weights = barycentric_foot(points, surface.vertices[index].astype(np.float64))
     normal = (weights[:, :, None] * surface.vertex_normals[index]).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     sign = np.where(((points - q) * normal).sum(axis=1) < 0, -1.0, 1.0)
     return np.concatenate([q, normal, (sign * np.linalg.norm(points - q, axis=1))[:, None]], axis=1)
-
-
-def barycentric_foot(points: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray:
-    """Return barycentric coordinates (n, 3) of the places of triangles a, b, c (n, 3) that are nearest to points."""
-    e, f, d = b - a, c - a, points - a
-    dot = lambda x, y: (x * y).sum(axis=1)  # noqa: E731
-    ee, ef, ff, de, df = dot(e, e), dot(e, f), dot(f, f), dot(d, e), dot(d, f)
-    area = np.maximum(ee * ff - ef * ef, 1e-300)
-    v, w = (ff * de - ef * df) / area, (ee * df - ef * de) / area
-    part = lambda x, y: np.clip(x / np.maximum(y, 1e-300), 0, 1)  # noqa: E731
-    s, t, u = part(de, ee), part(df, ff), part(df - de + ee - ef, ee + ff - 2 * ef)
-    zero = np.zeros_like(s)
-    edges = np.stack([np.stack([1 - s, s, zero], axis=1), np.stack([1 - t, zero, t], axis=1),
-                      np.stack([zero, 1 - u, u], axis=1)])
-    corners = np.stack([a, b, c], axis=1)
-    away = np.linalg.norm((edges[..., None] * corners).sum(axis=2) - points, axis=2)
-    best = edges[np.argmin(away, axis=0), np.arange(len(points))]
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1)
-    return np.where(inside[:, None], np.stack([1 - v - w, v, w], axis=1), best)

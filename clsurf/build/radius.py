@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from .point_tree import BLOCK, PointTree, column_bounds
 
@@ -77,11 +78,25 @@ def neighbour_spreads(tree: PointTree, chosen: NDArray) -> tuple[NDArray, NDArra
     `chosen` (c,) int32 are blocks of the tree, whose points are looked at; the first is -1 where there is none.
     """
     device = tree.device
+    if device.loop_turns is not None:  # looking through the blocks may take more
+        return _spreads_on_host(tree, chosen)
     spread, furthest2 = device.empty((len(chosen), BLOCK), np.float32), device.empty((len(chosen), BLOCK), np.float32)
     kernel = device.kernel("build/neighbor_spread.cl", constants={"NEIGHBORS": min(10, tree.count - 1)})
     kernel((len(chosen),), (1,), len(chosen), device.upload(chosen), *tree.arguments, 2.0 / math.sqrt(tree.count),
            spread, furthest2)
     return device.download(spread), device.download(furthest2)
+
+
+def _spreads_on_host(tree: PointTree, chosen: NDArray) -> tuple[NDArray, NDArray]:
+    points = tree.device.download(tree.sorted)[:3, :tree.count].T.astype(np.float64)
+    index = chosen[:, None].astype(np.int64) * BLOCK + np.arange(BLOCK)
+    real = index < tree.count
+    apart, near = cKDTree(points).query(points[index[real]], min(10, tree.count - 1) + 1)
+    local = points[near] - points[near].mean(axis=1, keepdims=True)
+    spread, furthest2 = np.full(index.shape, -1, np.float32), np.zeros(index.shape, np.float32)
+    spread[real] = np.maximum(np.linalg.eigvalsh(np.einsum("nki,nkj->nij", local, local) / near.shape[1])[:, 0], 0)
+    furthest2[real] = apart[:, -1] ** 2
+    return spread, furthest2
 
 
 def noise_of(spread: NDArray, furthest2: NDArray, neighbors: int) -> Noise:

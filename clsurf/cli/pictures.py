@@ -60,6 +60,8 @@ LodOption = Annotated[float, typer.Option(help="slim: projected diameter in pixe
                                           "silhouettes.")]
 InteriorOption = Annotated[float, typer.Option(help="surfels: projected diameter in pixels that they may have away "
                                                "from silhouettes.")]
+ReliefOption = Annotated[float, typer.Option(help="surfels: pixels that bumps on a surfel may appear away from where "
+                                             "they are; inf: surfels go by their size alone.")]
 NoMapsOption = Annotated[bool, typer.Option("--no-maps", help="surfels: one normal each, without normal maps.")]
 NodesOption = Annotated[str, typer.Option(help="patches: projection of nodes, exact, trilinear or homogeneous.")]
 CellsOption = Annotated[str, typer.Option(help="patches: what fills a cell, quads, triangles, bilinear or smooth.")]
@@ -128,7 +130,7 @@ def render(source: SourceArgument,
            bits: BitsOption = 8,
            lod: LodOption = 4.0, nodes: NodesOption = "exact", cells: CellsOption = "quads", alpha: AlphaOption = False,
            channel: ChannelOption = "", legend: LegendOption = False, limit: LimitOption = 0.0,
-           interior: InteriorOption = 16.0, no_maps: NoMapsOption = False,
+           interior: InteriorOption = 16.0, relief: ReliefOption = 0.75, no_maps: NoMapsOption = False,
            lines: LinesOption = "", on_white: OnWhiteOption = False,
            form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
            drawn_as: AsOption = "surface", point_size: PointSizeOption = "", eye_dome: EyeDomeOption = None,
@@ -157,7 +159,7 @@ def render(source: SourceArgument,
                          "write .exr")
     view = checked_view(direction, up, fov, eye, target, ortho)
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
-    surfels = clsurf.SurfelDrawing(interior, not no_maps)
+    surfels = clsurf.SurfelDrawing(interior, not no_maps, relief)
     lit = lighting(shading, light, shadows, occlusion, mirror, sky, material, up)
     lod, patch_drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
     scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
@@ -212,8 +214,8 @@ def report(source: SourceArgument,
            spacing: SpacingOption = None, map_size: MapSizeOption = None, hybrid: HybridOption = False,
            texels: TexelsOption = None, bits: MapBitsOption = None, layers: LayersOption = None,
            stored_normals: StoredNormalsOption = False, hit: HitOption = "", center: CenterOption = "",
-           interior: InteriorOption = 16.0, no_maps: NoMapsOption = False, form: FormOption = "cast",
-           faces: FacesOption = 6, normals: MapNormalsOption = "auto",
+           interior: InteriorOption = 16.0, relief: ReliefOption = 0.75, no_maps: NoMapsOption = False,
+           form: FormOption = "cast", faces: FacesOption = 6, normals: MapNormalsOption = "auto",
            device: DeviceOption = "", quiet: QuietOption = False):
     """Write one HTML page about a surface and a view of it: counts, operations, times, the picture."""
     import clsurf
@@ -225,7 +227,8 @@ def report(source: SourceArgument,
     how = recipe(kind, degree, error, map_size, hybrid, patches=patches, spacing=spacing)
     how = with_scale_map(how, texels, bits, layers, stored_normals, hit, center, ("texels", "stored-normals"))
     lod, drawing = checked_lod(lod), checked_drawing(nodes, cells, alpha)
-    surfels, scale_map = clsurf.SurfelDrawing(interior, not no_maps), clsurf.ScaleMapDrawing(form, faces, normals)
+    surfels = clsurf.SurfelDrawing(interior, not no_maps, relief)
+    scale_map = clsurf.ScaleMapDrawing(form, faces, normals)
     chosen = clsurf.open_device(device or None)
     thing = loaded_surface(source, how, chosen, steps, whole=True)
     with steps.step("report"):

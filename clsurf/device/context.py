@@ -17,6 +17,7 @@ from ..errors import DeviceError, DeviceMemoryError  # noqa: E402
 from . import pocl_fork, pocl_target  # noqa: E402
 from .arrays import KEPT_BYTES, DeviceArray, HostPool, give_back, is_aligned, new_array  # noqa: E402
 from .program import Kernel, Profile, build_program, make_kernel  # noqa: E402
+from .sources import number_of  # noqa: E402
 
 log = logging.getLogger("clsurf")
 
@@ -57,6 +58,8 @@ class Device:
     memory_bytes, largest_buffer_bytes, local_bytes : int
     lanes : int
         Default kernel form: vector lanes of one work-item (16, 8 or 4), or 1 for a work-group per tile.
+    loop_turns : int or None
+        After so many turns of a work-item's loops, all loops together, the driver ends them (llvmpipe); None: never.
     group_items : int
         Items that run side by side: those of a launch without groups of its own are put together by so many.
     profile : Profile or None
@@ -73,6 +76,8 @@ class Device:
         self.memory_bytes, self.largest_buffer_bytes = cl_device.global_mem_size, cl_device.max_mem_alloc_size
         self.local_bytes = cl_device.local_mem_size
         self.lanes = 16 if self.kind == "cpu" and not any(word in self.name.lower() for word in SINGLE) else 1
+        # LP_MAX_TGSI_LOOP_ITERATIONS in Mesa: no error, the kernel goes on behind each loop.
+        self.loop_turns = 65535 if "llvmpipe" in self.name.lower() else None
         # llvmpipe runs 8 as lanes (58 balls of fit_surfels: 0.15 s, 1.4 one by one); where lanes are 16, one is enough.
         self.group_items = 1 if self.lanes > 1 else 8 if self.kind == "cpu" else 64
         self.profile: Profile | None = None
@@ -92,6 +97,7 @@ class Device:
         self._programs: dict = {}
         self._kernels = threading.local()
         self.in_flight: list = []  # arguments of launches that may still run: their host memory must outlive them
+        self.ended = None if self.loop_turns is None else self.upload(np.zeros(2, np.int32))  # sources.py, watched
 
     def __repr__(self):
         return f"Device({self.name!r}, {self.platform_name!r}, {self.kind}, {self.units} units)"
@@ -208,6 +214,7 @@ class Device:
         if array.host is None:
             out = np.empty(array.shape, array.dtype)
             cl.enqueue_copy(self.queue, out, array.buffer, is_blocking=True)
+            self._check_loops()
             return out
         # Mapping is what makes the host's view of the pages valid.
         done, self.in_flight = self.in_flight, []
@@ -215,6 +222,7 @@ class Device:
                                           is_blocking=True)
         mapped.base.release(self.queue)
         del done  # the queue is in order: every launch before the mapping has ended
+        self._check_loops()
         return array.host.copy() if copy else array.host
 
     @_told
@@ -231,8 +239,21 @@ class Device:
         self.finish()
         for array in mapped:
             array.base.release(self.queue)
+        self._check_loops()
         return {name: self.download(array, copy=False) if array.host is None else array.host
                 for name, array in arrays.items()}
+
+    def _check_loops(self) -> None:
+        """Raise DeviceError where the driver has ended a loop of a kernel before its time."""
+        if self.ended is None:
+            return
+        told = np.empty(2, np.int32)
+        cl.enqueue_copy(self.queue, told, self.ended.buffer, is_blocking=True)
+        if told[1]:
+            cl.enqueue_copy(self.queue, self.ended.buffer, np.zeros(2, np.int32), is_blocking=True)
+            names = {name for _, name in self._kernels.__dict__ if number_of(name) == told[1]}
+            raise DeviceError(f"device {self.name}: its driver ends loops after {self.loop_turns:,} turns, too few "
+                              f"for {' '.join(names) or 'a kernel'}: use another device (clsurf devices)")
 
     def keep(self, nbytes: int | None) -> int | None:
         """Keep at most `nbytes` of unused memory for reuse, or the default; return the limit before."""

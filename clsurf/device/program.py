@@ -13,7 +13,7 @@ import pyopencl as cl
 
 from ..errors import KernelBuildError
 from .arrays import DeviceArray
-from .sources import argument_dtypes, kernel_text
+from .sources import ENDED, argument_dtypes, kernel_text, watched
 
 # -w: PoCL prints its compiler's warnings straight to the terminal.
 BUILD_OPTIONS = ["-cl-std=CL1.2", "-cl-mad-enable", "-w"]
@@ -28,10 +28,11 @@ class Kernel:
     buffers, `pyopencl.LocalMemory`, or numbers, which are cast to the kernel's own types.
     """
 
-    def __init__(self, device, kernel, label, dtypes, free=False):
+    def __init__(self, device, kernel, label, dtypes, free=False, ended=False):
         self.device, self.kernel, self.label, self.free = device, kernel, label, free
         kernel.set_scalar_arg_dtypes(dtypes)
-        self.count = len(dtypes)
+        self.watched = ended
+        self.count = len(dtypes) - 2 * ended
 
     def __call__(self, global_size, local_size, *arguments):
         """Enqueue a launch; with a profile, wait for it and record its time."""
@@ -42,7 +43,8 @@ class Kernel:
         # PoCL crashes with local_size=None on kernels with large private arrays.
         local_size = local_size or (1,) * len(global_size)
         global_size = tuple(-(-g // s) * s for g, s in zip(global_size, local_size, strict=True))
-        self.kernel.set_args(*(a.buffer if isinstance(a, DeviceArray) else a for a in arguments))
+        told = (global_size[0], self.device.ended.buffer) if self.watched else ()
+        self.kernel.set_args(*(a.buffer if isinstance(a, DeviceArray) else a for a in arguments), *told)
         try:
             self._launch(global_size, local_size, arguments)
         except cl.Error as error:
@@ -63,6 +65,10 @@ class Kernel:
     def _enqueue(self, global_size, local_size) -> None:
         """Launch; items that are asked for one by one go in groups where the device runs those side by side."""
         queue, items = self.device.queue, self.device.group_items
+        if self.watched and self.free and set(local_size) == {1}:
+            size = -(-global_size[0] // items) * items, *global_size[1:]
+            cl.enqueue_nd_range_kernel(queue, self.kernel, size, (items, *local_size[1:]))
+            return
         if not (self.free and items > 1 and local_size == (1,) and global_size[0] >= items):
             cl.enqueue_nd_range_kernel(queue, self.kernel, global_size, local_size)
             return
@@ -102,6 +108,7 @@ class Profile:
 def build_program(device, path: str, constants: dict | None):
     """Compile the kernel file `path` for `device`; return (program, text)."""
     text = kernel_text(path, device.own_constants | (constants or {}))
+    text = text if device.ended is None else watched(text)
     dump = os.environ.get("CLSURF_DUMP")
     if dump:
         key = hashlib.sha256(text.encode()).hexdigest()[:8]
@@ -125,4 +132,4 @@ def build_program(device, path: str, constants: dict | None):
 def make_kernel(device, program, text, name) -> Kernel:
     """Return a kernel object of `program` for the calling thread."""
     free = not GROUPED.search(re.sub(r"//[^\n]*", "", text))
-    return Kernel(device, cl.Kernel(program, name), name, argument_dtypes(text, name), free)
+    return Kernel(device, cl.Kernel(program, name), name, argument_dtypes(text, name), free, ENDED in text)

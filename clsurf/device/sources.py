@@ -5,6 +5,7 @@ No -I and no -D reach a driver's compiler: paths with spaces and quoted values b
 
 import functools
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,43 @@ def kernel_text(path: str, constants: dict | None = None) -> str:
             value = f"{float(value)!r}f" if np.isfinite(value) else "INFINITY"
         lines.append(f"#define {name} {value}\n")
     return "".join(lines) + expanded(path)
+
+
+ENDED = "clsurf_ended"  # the last of the two arguments that watched kernels have behind their own
+WATCH = """
+{head}, int clsurf_items, __global int *{ended}) {{
+  if ((int)get_global_id(0) < clsurf_items) own_{name}({arguments});
+  int turns = 0;
+  for (uint i = 0; i < get_work_dim() + 1u; i++) turns++;
+  {ended}[turns == (int)get_work_dim() + 1 ? 0 : 1] = {number};
+}}
+"""
+
+
+def number_of(kernel: str) -> int:
+    """Return the number by which a watched kernel tells which it is."""
+    return zlib.crc32(kernel.encode()) & 0x7FFFFFFF
+
+
+def watched(text: str) -> str:
+    """Return kernel text for a driver that ends loops after some turns, all loops of a work-item together.
+
+    Of groups that are not full llvmpipe lets the items that are missing run on in loops until these turns are used up.
+    So groups are filled up: only the first `clsurf_items` along x do anything. Each kernel ends with a short loop more;
+    where that is cut off, the kernel's own may have been, and it writes its number into ``ended[1]``. Kernels with
+    local memory or barriers, whose groups are full, stay as they are.
+    """
+    text = re.sub(r"//[^\n]*|/\*.*?\*/", lambda match: "\n" * match[0].count("\n"), text, flags=re.S)
+    if re.search(r"\b__local\b|\bbarrier\b", text):
+        return text
+    found = list(SIGNATURE.finditer(text))
+    for match in reversed(found):
+        text = f"{text[:match.start()]}void own_{match[1]}({match[2]}){text[match.end():]}"
+    for match in found:
+        arguments = ", ".join(re.findall(r"(\w+)\s*(?:,|$)", match[2].strip()))
+        text += WATCH.format(head=match[0][:-1], ended=ENDED, name=match[1], arguments=arguments,
+                             number=number_of(match[1]))
+    return text
 
 
 def argument_dtypes(text: str, kernel: str) -> list:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from clsurf.errors import FileFormatError, InputError
 
-from .files import existing_file, replacing
+from .files import existing_file, one_line, replacing
 
 # COLMAP's models: name, number of parameters, of focal lengths; the centre follows, then the distortion.
 MODELS = {0: ("SIMPLE_PINHOLE", 3, 1), 1: ("PINHOLE", 4, 2), 2: ("SIMPLE_RADIAL", 4, 1), 3: ("RADIAL", 5, 1),
@@ -224,13 +224,13 @@ def _read_colmap(cameras_path: Path, images_path: Path, distortion: str) -> Came
         raise FileFormatError(f"{images_path}: expected at least one image, got none")
     pinholes, records = {}, []
     for name, lens, quaternion, translation in sorted(images):
+        where = f"{images_path}: image {one_line(name)}"
         if lens not in lenses:
-            raise FileFormatError(f"{images_path}: image {name}: camera {lens} is not in {cameras_path.name}")
+            raise FileFormatError(f"{where}: camera {lens} is not in {cameras_path.name}")
         if lens not in pinholes:
             pinholes[lens] = _pinhole(f"{cameras_path}: camera {lens}", *lenses[lens], distortion)
         matrix, size = pinholes[lens]
-        records.append(CameraRecord(name, _colmap_pose(f"{images_path}: image {name}", quaternion, translation), size,
-                                    matrix))
+        records.append(CameraRecord(name, _colmap_pose(where, quaternion, translation), size, matrix))
     _check_names(images_path, records)
     return CameraFile(tuple(records))
 
@@ -351,6 +351,6 @@ def _binary_images(path: Path) -> list:
         (points,), at = struct.unpack_from("<Q", data, end + 1), end + 9
         at += 24 * points
         if at > len(data):
-            raise FileFormatError(f"{path}: truncated: {points:,} points of image {images[-1][0]} do not fit in "
-                                  f"{math.ceil(len(data) / 1024):,} KB")
+            raise FileFormatError(f"{path}: truncated: {points:,} points of image {one_line(images[-1][0])} do not fit "
+                                  f"in {math.ceil(len(data) / 1024):,} KB")
     return images

@@ -96,8 +96,8 @@ def write_array(file, rows) -> None:
     file.write(memoryview(rows).cast("B") if rows.size else b"")
 
 
-def one_line(error: BaseException) -> str:
-    """Return the message of `error` on one line, shortened to 200 characters."""
+def one_line(error: BaseException | str) -> str:
+    """Return the message of `error`, or a text, on one line, shortened to 200 characters."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 200 else text[:197] + "..."
 

@@ -94,6 +94,9 @@ class StoredSurface:
             count = int(values["parts"])
             self.part_bounds = self._checked("bounds", (count, 2, 3))[...]
             self.surfels = self._checked("surfels", (count, -1))[...]
+            if self.surfels.dtype.kind not in "iu" or not ((self.surfels >= 0) & (self.surfels < 1 << 40)).all():
+                raise FileFormatError(f"{self.place}: surfels: expected counts, got {self.surfels.min()} to "
+                                      f"{self.surfels.max()}: damaged")
             self.colored = bool(values.get("colored"))
             self.origin = self._checked("parts/00000/origin", (3,))[...]
 

@@ -39,10 +39,12 @@ def trace(thing, origins, directions, query: str = "closest", near=0.0, far=np.i
         World space, float64; broadcast against each other. Directions need not be unit; a ray whose direction is zero
         or whose numbers are not finite misses.
     query : str
-        "closest"; "any": some hit, not always the nearest, and not blended, which is faster; "all".
+        "closest"; "any": some hit, not always the nearest, and not blended, which is faster; "all": where spatial
+        patches overlap, each of them is hit.
     near, far : float or (...) array_like
         Hits are looked for between these distances (world units), `near` itself left out: for rays that start on the
-        surface.
+        surface. Rays that start at a hit of SLIM surfels, discs or patches meet their neighbours there: start them
+        1/20 of a median radius (of patches: of a node's spacing) up `Hits.normal`, with `near` half of it.
     device : None, str or Device
     progress : function, optional
         ``progress(stage, share done)``; False stops the work.

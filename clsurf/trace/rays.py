@@ -23,7 +23,8 @@ class Hits:
     position : (n, 3) float64
         NaN: missed.
     normal : (n, 3) float64
-        Unit, toward the side that the ray comes from; NaN: missed.
+        Unit, toward the side that the ray comes from; NaN: missed. Of meshes, patches and hybrid hierarchies the
+        triangle's own, which the renderer's smooth normals are near to.
     surface : (n,) int32
         Number of the surface in the scene or list, 0 for a single surface; -1: missed.
     primitive : (n,) int32

@@ -69,5 +69,5 @@ def finish_rays_host(origins: NDArray, directions: NDArray, place: NDArray, star
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     with np.errstate(all="ignore"):
         normal = np.where(length > 0, normal / length, -d)
-    normal = np.where((normal * d).sum(axis=1, keepdims=True) > 0, -normal, normal)
-    return distance, origins + distance[:, None] * d, normal
+        normal = np.where((normal * d).sum(axis=1, keepdims=True) > 0, -normal, normal)
+        return distance, origins + distance[:, None] * d, normal  # not a number where nothing was hit

@@ -121,6 +121,10 @@ def _split(device: Device, low: NDArray, high: NDArray, roots: int, full: int) -
     rest, keys = device.empty((n,), np.int32), device.empty((n,), np.float32)
     parts = np.array([[0, n, roots * full]], np.int32)
     while parts[:, 2].max() > 1:
+        if device.loop_turns is not None and 16 * parts[:, 1].max() > device.loop_turns:
+            parts, items = _split_at_medians(parts, device.download(order), low, high, full)
+            order = device.upload(items)
+            continue
         halves = device.empty((2 * len(parts), 3), np.int32)
         device.kernel("trace/split_nodes.cl")((len(parts),), (1,), len(parts), full, device.upload(parts), order,
                                               *boxes, halves, other, rest, keys)
@@ -128,6 +132,26 @@ def _split(device: Device, low: NDArray, high: NDArray, roots: int, full: int) -
         parts = np.ascontiguousarray(parts[parts[:, 2] > 0])
         order, other = other, order
     return device.download(order, copy=False), parts[:, 1]
+
+
+def _split_at_medians(parts: NDArray, order: NDArray, low: NDArray, high: NDArray,
+                      full: int) -> tuple[NDArray, NDArray]:
+    """Return the halves of parts (n, 3) and the new order: a round for devices whose loops end too early for it.
+
+    A part is divided along its centres' longest side, where both halves' nodes become about as full.
+    """
+    order, halves = order.copy(), []
+    for start, count, room in parts.tolist():
+        left = -(-(room // full) // 2) * full if room > full else -(-room // 2)
+        first = min(count, WIDTH * left)
+        if count > WIDTH and room > 1:
+            items = order[start:start + count]
+            centers = low[items] / 2 + high[items] / 2
+            keys = centers[:, np.argmax(np.ptp(centers, axis=0))]
+            first = max(min(count // WIDTH * left // room * WIDTH, first), count - WIDTH * (room - left), 0)
+            order[start:start + count] = items[np.argsort(keys, kind="stable")]
+        halves += [(start, first, left), (start + first, count - first, room - left)]
+    return np.array([half for half in halves if half[2] > 0], np.int32), order
 
 
 def node_boxes(tree: Tree, low: NDArray, high: NDArray) -> NDArray:
