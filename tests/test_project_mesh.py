@@ -84,6 +84,20 @@ def test_placed_meshes_and_scenes_of_nothing(device):
         clsurf.project("bunny.ply", [[0.0, 0, 0]], device)
 
 
+def test_triangles_larger_than_a_device_are_looked_through_in_parts(device):
+    """Meshes, hybrid hierarchies and scale maps: the nearest places of the whole."""
+    mesh = torus_mesh(80, 40)
+    for thing in (mesh, clsurf.build_surfels(mesh, hybrid=True, device=device)):
+        points = np.random.default_rng(2).uniform(-3, 3, (3000, 3))
+        wanted = clsurf.project(thing, points, device=device)
+        with small(device, 100_000):
+            got = clsurf.project(thing, points, device=device)
+        np.testing.assert_allclose(np.abs(got.distance), np.abs(wanted.distance), atol=1e-6)
+        # Where two faces are as near, either may be taken.
+        assert (np.abs(got.position - wanted.position).max(axis=1) < 1e-5).mean() > 0.99
+        assert (np.abs(got.normal - wanted.normal).max(axis=1) < 1e-3).mean() > 0.99
+
+
 @pytest.mark.parametrize("edge", [1e-7, 3e-4, 1.0, 1e5])
 def test_feet_do_not_depend_on_the_unit(device, edge):
     """Scans in metres have edges of a tenth of a millimetre: their feet lie in faces, not on edges."""
@@ -115,17 +129,3 @@ def test_feet_on_needles_and_faces_without_area():
     assert (away <= nearest + 1e-9).all() and (away > nearest - 0.1).all()
     assert (weights >= 0).all() and np.allclose(weights.sum(axis=1), 1)
     assert np.allclose(np.einsum("ni,nij->nj", weights, corners), foot)
-
-
-def test_triangles_larger_than_a_device_are_looked_through_in_parts(device):
-    """Meshes, hybrid hierarchies and scale maps: the nearest places of the whole."""
-    mesh = torus_mesh(80, 40)
-    for thing in (mesh, clsurf.build_surfels(mesh, hybrid=True, device=device)):
-        points = np.random.default_rng(2).uniform(-3, 3, (3000, 3))
-        wanted = clsurf.project(thing, points, device=device)
-        with small(device, 100_000):
-            got = clsurf.project(thing, points, device=device)
-        np.testing.assert_allclose(np.abs(got.distance), np.abs(wanted.distance), atol=1e-6)
-        # Where two faces are as near, either may be taken.
-        assert (np.abs(got.position - wanted.position).max(axis=1) < 1e-5).mean() > 0.99
-        assert (np.abs(got.normal - wanted.normal).max(axis=1) < 1e-3).mean() > 0.99
