@@ -96,6 +96,8 @@ def test_a_plane_across_the_view_is_a_near_plane(form, cells, renderers):
     cut = renderers[form].render(surface, EYE, SIZE, lod=0, clip=[*ahead, -(ahead @ EYE.eye) - 4.25], **options)
     assert 0.1 < np.isfinite(near.depth).mean() and np.nanmin(near.depth) > 4.15
     same = np.isclose(near.depth, cut.depth, atol=1e-5, equal_nan=True)
+    # Where they cut, points of two patches, of other colours, may win a pixel and show the same place of its ray.
+    same &= np.isclose(near.normal, cut.normal, atol=1e-3, equal_nan=True).all(axis=2)
     assert same.mean() > (0.95 if cells in ("bilinear", "smooth") else 0.995)
     np.testing.assert_allclose(near.color[same], cut.color[same], atol=5e-3)
 
