@@ -1,7 +1,8 @@
 """The steps of a streamed build in this process: chunks are read ahead, cells are built two at a time."""
 
 import contextlib
-from concurrent.futures import ThreadPoolExecutor
+import itertools
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 
 from ..device.arrays import give_back
 from ..io.chunks import Source
@@ -34,31 +35,30 @@ class Here:
         """Check the coarse leaves against every cell."""
         build = self.build
         missing = [number for number in numbers if not build.check_written(number)]
-        for done in at_once(missing, build.check):
-            report("check", done / len(missing))
+        at_once(missing, build.check, lambda done: report("check", done / len(missing)))
 
     def cells(self, numbers, report) -> None:
         """Build the cells that are missing."""
         build = self.build
         missing = [number for number in numbers if not build.cell_written(number)]
-        for done in at_once(missing, build.build):
-            report("cells", done / (len(missing) + 1))
+        at_once(missing, build.build, lambda done: report("cells", done / (len(missing) + 1)))
 
 
-def at_once(numbers, step):
-    """Call step(number) for each, AT_ONCE at a time; yield after each how many are done.
+def at_once(numbers, step, report) -> None:
+    """Call step(number) for each, AT_ONCE at a time, and report(how many are done) after each.
 
-    Where one fails or the caller stops, what has begun ends and the rest is left.
+    Where one fails or `report` raises, what has begun ends and the rest is left.
     """
+    left, done = iter(numbers), 0
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        waiting = [pool.submit(step, number) for number in numbers]
-        try:
-            for done, future in enumerate(waiting):
+        begun = {pool.submit(step, number) for number in itertools.islice(left, AT_ONCE)}
+        while begun:
+            ended, begun = wait(begun, return_when=FIRST_COMPLETED)
+            for future in ended:
                 future.result()
-                yield done + 1
-        finally:
-            for future in waiting:
-                future.cancel()
+                done += 1
+                report(done)
+            begun |= {pool.submit(step, number) for number in itertools.islice(left, len(ended))}
 
 
 def ahead(numbers, read):

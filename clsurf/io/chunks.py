@@ -130,8 +130,9 @@ class CloudSource(Source):
 class _Las(Source):
     def __init__(self, path: Path, chunk_points: int):
         super().__init__(path, chunk_points)
-        from .las import opened
-        with opened(path) as reader:
+        from .las import checked_backend, opened
+        self._backend = checked_backend(path)  # its checks look at every chunk: once a file
+        with opened(path, self._backend) as reader:
             self.count = reader.header.point_count
             self._names = set(reader.header.point_format.dimension_names)
         self.chunks = -(-self.count // chunk_points)
@@ -139,7 +140,7 @@ class _Las(Source):
 
     def _read(self, number: int) -> Chunk:
         from .las import opened
-        with opened(self.path) as reader:
+        with opened(self.path, self._backend) as reader:
             reader.seek(number * self.chunk_points)
             wanted = min(self.chunk_points, self.count - number * self.chunk_points)
             block = reader.read_points(wanted)

@@ -56,22 +56,33 @@ def read_las(path: Path) -> PointCloud:
     return PointCloud(points, normals, colors, origin=middle * header.scales + header.offsets, attributes=attributes)
 
 
+def checked_backend(path: Path) -> laspy.LazBackend:
+    """Return the decoder for a file whose counts the file has room for; raises FileFormatError."""
+    _check_records(path)
+    with _told(path), laspy.open(path) as reader:
+        largest = _check_counts(path, reader.header)
+    return laspy.LazBackend.LazrsParallel if largest <= _LARGEST_CHUNK else laspy.LazBackend.Lazrs
+
+
 @contextlib.contextmanager
-def opened(path: Path):
-    """Yield laspy's reader of a file whose counts the file has room for.
+def opened(path: Path, backend: laspy.LazBackend | None = None):
+    """Yield laspy's reader of a file; `backend`: what `checked_backend` returned for it before.
 
     Raises
     ------
     FileFormatError
         A damaged or truncated file, also where the decoder fails meanwhile.
     """
-    _check_records(path)
+    backend = checked_backend(path) if backend is None else backend
+    with _told(path), laspy.open(path, laz_backend=backend) as reader:
+        yield reader
+
+
+@contextlib.contextmanager
+def _told(path: Path):
+    """Turn the decoder's failure into FileFormatError."""
     try:
-        with laspy.open(path) as reader:
-            largest = _check_counts(path, reader.header)
-        backend = laspy.LazBackend.LazrsParallel if largest <= _LARGEST_CHUNK else laspy.LazBackend.Lazrs
-        with laspy.open(path, laz_backend=backend) as reader:
-            yield reader
+        yield
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # how the decoder's Rust code fails; not an Exception
             raise

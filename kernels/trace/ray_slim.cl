@@ -96,7 +96,7 @@ INLINE float store_blend(__global float *out, Found hit, const Sum *sum, __globa
   out[HIT_T] = hit.t + sum->step / sum->weight;
   out[HIT_NORMAL] = sum->x; out[HIT_NORMAL + 1] = sum->y; out[HIT_NORMAL + 2] = sum->z;
   out[HIT_PRIMITIVE] = as_float(order[hit.slot]);
-  out[HIT_SIDE] = sum->weight < SUPPORT ? 2.0f * hit.side : hit.side;  // its sign is the side
+  out[HIT_SIDE] = sum->weight < SUPPORT ? WEAK * hit.side : hit.side;
 #if MODE == NEXT
   out[HIT_LOW] = hit.t + sum->last;
   out[HIT_STATE] = hit.t + records[(size_t)hit.slot * SURFEL_FLOATS + OF_SIZE];

@@ -127,7 +127,7 @@ __kernel void ray_surfels(int count, int batch, int roots, int first_bottom, flo
     out[HIT_NORMAL] = found.face * found.x; out[HIT_NORMAL + 1] = found.face * found.y;
     out[HIT_NORMAL + 2] = found.face * found.z;
     out[HIT_PRIMITIVE] = as_float(order[slot]);
-    out[HIT_SIDE] = waits ? 3.0f : found.face;
+    out[HIT_SIDE] = waits ? WAITS : found.face;
     out[HIT_LOW] = found.last > t ? found.last : t; out[HIT_STATE] = 0.0f;
   }
 }
