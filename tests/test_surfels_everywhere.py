@@ -96,8 +96,11 @@ def test_discs_seen_from_behind_are_set_back(form, radius):
                                                      (0.9, (-1, -1), 5.0), (0.8, (-1, -1), 4.0)])
 def test_no_inside_is_seen_past_the_inner_part_of_a_disc(form, x, facing, wanted):
     """The inner 0.85 of a disc hide all; the rest blends, and hides discs that are seen from behind."""
-    for depth, z in seen_from_above(plates(1.0, 1.0, facing, 0.5), x, form):
+    discs = plates(1.0, 1.0, facing, 0.5)
+    for depth, z in seen_from_above(discs, x, form):
         assert depth == pytest.approx(wanted, abs=1e-5) and z > 0.99
+    for query in ("closest", "any"):  # what decides lies past the ray's end
+        assert trace(discs, (x, 0, 4), (0, 0, -1), query, far=4.5, device=form).hit == (wanted < 4.5)
 
 
 def test_a_sheet_drawn_before_does_not_hide_what_a_gap_shows(form):
