@@ -110,13 +110,13 @@ def test_maps_larger_than_a_device_are_drawn_in_parts(device, lanes, drawing):
     base = smooth_map(48, f=bumpy)
     scales = np.concatenate([base.scales, base.scales * np.float32(0.7)])
     valid = np.concatenate([base.valid] * 2)
-    valid[0, :, 16:32, 16:32] = False  # the second layer shows through
+    valid[0, :, 20:28, 20:28] = False  # the second layer shows through
     surface = clsurf.ScaleMap(base.center, base.radius, scales, valid)
     camera = clsurf.Camera.framing(surface, direction=(0.4, -0.6, 1))
     channels = ("color", "depth", "normal", "id", "level")
     with clsurf.Renderer(device, lanes=lanes) as renderer:
         wanted = renderer.render(surface, camera, SIZE, channels, scale_map=drawing)
-    assert min((wanted.level == 0).sum(), (wanted.level == 1).sum()) > 100
+    assert min((wanted.level == 0).sum(), (wanted.level == 1).sum()) > 50
     again = clsurf.ScaleMap(base.center, base.radius, scales, surface.valid)
     with small(device, 400_000) as used, clsurf.Renderer(device, lanes=lanes) as renderer:
         for _ in range(2):
