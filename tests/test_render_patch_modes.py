@@ -9,6 +9,7 @@ from reference.patch_scenes import CAMERAS, FRONT, SIZE, disc, joined, rough, sh
 from reference.surfaces import sphere
 from scipy import ndimage
 
+from clsurf.models import perfect_sphere
 from clsurf.render.camera import Camera
 from clsurf.render.patch_alpha import extended
 from clsurf.render.patch_drawing import PatchDrawing
@@ -120,6 +121,19 @@ def test_depth_at_the_contour_of_a_dome(renderers, cells, most):
         error = cosine * np.abs(frame.depth.ravel() + far * (directions @ camera.rotation[2]))
         assert (seen & (cosine < 0.1)).sum() > 100 and (seen & (cosine < 0.03)).sum() > 10
         assert error[seen].max() < most
+
+
+@pytest.mark.parametrize("cells", ["bilinear", "smooth"])
+def test_nothing_shows_further_off_a_sphere_than_half_a_pixel(renderers, cells):
+    """Along the outline a pixel's ray may miss the sphere whose point it shows: by half a diagonal at most."""
+    surface, size = perfect_sphere(), (480, 270)
+    camera = Camera.framing(surface, aspect=size[0] / size[1])
+    _, directions = camera.rays(size)
+    turn = np.linalg.norm(directions.reshape(270, 480, 3)[135, 241] - directions.reshape(270, 480, 3)[135, 240])
+    for renderer in renderers[:2]:
+        frame = renderer.render(surface, camera, size, ("depth", "position"), patches=PatchDrawing(cells=cells))
+        away = np.abs(np.linalg.norm(frame.position, axis=2) - 128)[np.isfinite(frame.depth)]
+        assert len(away) > 30_000 and away.max() < np.sqrt(0.5) * turn * np.linalg.norm(camera.eye)
 
 
 def test_smooth_cells_have_continuous_normals(renderers):
