@@ -1,5 +1,6 @@
 """The command line as a user meets it."""
 
+import logging
 import os
 import signal
 import subprocess
@@ -93,9 +94,11 @@ def test_build_info_render_convert(scan, tmp_path, capsys, on_device):
 
 
 def test_quiet_says_nothing(scan, tmp_path, capsys, on_device):
+    level = logging.getLogger("clsurf").level
     assert main(["build", str(scan), str(tmp_path / "b.clsurf"), "--quiet"]) == 0
     out = capsys.readouterr()
     assert out.out == "" and out.err == ""
+    assert logging.getLogger("clsurf").level == level, "a program that calls main keeps its own level"
 
 
 def test_demo(tmp_path, capsys, on_device):

@@ -55,6 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
         else logging.StreamHandler()
     logger = logging.getLogger("clsurf")
     logger.addHandler(handler)
+    before = logger.level  # put back: a program that calls this keeps its own
     logger.setLevel(logging.ERROR if quiet else logging.INFO)
     try:
         # The option parser turns Ctrl-C and an exit asked for into a code that it returns.
@@ -90,6 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
         raise
     finally:
         logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 if __name__ == "__main__":
