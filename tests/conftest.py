@@ -9,6 +9,7 @@ from bench.answer_scenes import forms
 from clsurf.device import open_device
 from clsurf.render.renderer import Renderer
 from clsurf.render.tiles import Scratch
+from clsurf.trace.single import has_doubles
 
 _without_data: list[str] = []
 
@@ -27,7 +28,14 @@ def device():
 
 
 def pytest_collection_modifyitems(config, items):
-    """On a device of single items, kernels of several lanes are left out: nobody gets them there (clsurf/device)."""
+    """What a device has not is left out: kernels in float64, and of several lanes where it works on single items.
+
+    Nobody gets those kernels there (clsurf/trace/single.py, clsurf/device).
+    """
+    doubles = [item for item in items if item.get_closest_marker("float64")]
+    if doubles and not has_doubles(open_device(os.environ.get("CLSURF_DEVICE") or "pocl")):
+        config.hook.pytest_deselected(items=doubles)
+        items[:] = [item for item in items if item not in set(doubles)]
     asked = [(item, item.callspec.params.get(name)) for item in items if hasattr(item, "callspec")
              for name in ("lanes", "form", "either_form")]
     wide = {item: lanes for item, lanes in asked if lanes in (4, 8, 16)}

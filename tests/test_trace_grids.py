@@ -25,6 +25,7 @@ def grid(device, origins, directions, near=0.0):
     return grids.grid_of(device, checked_rays(origins, directions, near, np.inf))
 
 
+@pytest.mark.float64
 @pytest.mark.parametrize("name", CAMERAS)
 def test_the_grid_of_a_camera_is_found(device, name):
     camera = CAMERAS[name]
@@ -47,6 +48,7 @@ def test_the_grid_of_a_camera_is_found(device, name):
     assert grid(device, *flipped) is None
 
 
+@pytest.mark.float64
 @pytest.mark.parametrize("lanes", [16, 1])
 @pytest.mark.parametrize("name", CAMERAS)
 def test_packets_hit_what_single_rays_hit(device, monkeypatch, torus, name, lanes):
@@ -75,6 +77,7 @@ def test_packets_hit_what_single_rays_hit(device, monkeypatch, torus, name, lane
     assert np.isnan(got.position[~got.hit]).all() and (got.primitive[~got.hit] == -1).all()
 
 
+@pytest.mark.float64
 @pytest.mark.parametrize("perspective", [True, False])
 def test_on_grid(device, perspective):
     """Rays off by a little and by too much, against the twin, one at a time."""

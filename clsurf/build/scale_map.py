@@ -29,6 +29,7 @@ LARGEST_SIZE, LARGEST_LAYERS = 4096, 64
 BOUND_SHARE = 0.95
 TOLERANCE = 1e-5  # of the radius: hits so far beyond the sphere still count as on it
 VISIBLE_SIZE = 24  # texels across a face of the maps that look for the centre that sees most
+TEXEL_TURNS = 2  # of loops for each texel that scale_hits.cl tests, on all six faces at worst
 NEAR_SHARE = 0.03  # of the radius: how near a map must come to a sample to hold it
 SAMPLES = 4000  # of the surface, for that
 
@@ -214,9 +215,13 @@ class _Triangles:
         places = device.zeros(texels, np.uint32)
         unused = device.empty(4, np.float32)
 
+        rows = size if device.loop_turns is None else max(device.loop_turns // (6 * TEXEL_TURNS * size), 1)
+
         def draw(fill, ends, distances, triangles):
-            device.kernel("build/scale_hits.cl", constants={"VW": lanes, "FILL": fill})(
-                (self.count,), (64,), self.count, vertices, self.faces, size, places, ends, distances, triangles)
+            kernel = device.kernel("build/scale_hits.cl", constants={"VW": lanes, "FILL": fill})
+            for first in range(0, size, rows):
+                kernel((self.count,), (64,), self.count, vertices, self.faces, size, first, first + rows - 1, places,
+                       ends, distances, triangles)
 
         draw(0, places, unused, unused)
         ends = np.cumsum(device.download(places), dtype=np.uint64)

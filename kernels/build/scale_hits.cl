@@ -1,6 +1,7 @@
 // Where the rays from a centre through the texels of a cube map meet triangles: every triangle is drawn onto the faces
 // of the cube that it may touch. A first launch counts the hits of every texel, a second one (FILL) writes them into
 // lists, in any order; pick_scale_hits sorts those. One work-item per triangle, the lanes are blocks of 4 x VW / 4 texels.
+// Only rows from first_row to last_row of each face are drawn: drivers that end long loops get a launch for every few.
 //
 // The test of an edge is that of single rays (common/edge_side.clh): a closed mesh is met without leaks, and an odd
 // number of times from inside. Twin: tests/reference/scale_map.py, scale_hits.
@@ -27,7 +28,8 @@ INLINE int last_texel(float high, int size) {
 }
 
 __kernel void scale_hits(int count, __global const float *vertices /* relative to the centre, in radii */,
-                         __global const int *faces, int size, __global uint *places /* per texel: hits so far */,
+                         __global const int *faces, int size, int first_row, int last_row,
+                         __global uint *places /* per texel: hits so far */,
                          __global const uint *ends, __global float *distances, __global int *triangles) {
   int triangle = get_global_id(0);
   if (triangle >= count) return;
@@ -49,6 +51,7 @@ __kernel void scale_hits(int count, __global const float *vertices /* relative t
       j0 = first_texel(least3(a[0], a[1], a[2]), size); j1 = last_texel(most3(a[0], a[1], a[2]), size);
       i0 = first_texel(least3(b[0], b[1], b[2]), size); i1 = last_texel(most3(b[0], b[1], b[2]), size);
     }
+    i0 = max(i0, first_row); i1 = min(i1, last_row);
     for (int i = i0; i <= i1; i += ROWS)
       for (int j = j0; j <= j1; j += COLUMNS) {
 #if VW == 1
