@@ -69,6 +69,25 @@ def lanes(request, device, monkeypatch):
     return request.param
 
 
+@pytest.fixture
+def largest_buffer(device, monkeypatch):
+    """Return a function that limits the bytes of a buffer: a larger one is an error, as on a device of this limit."""
+    limits = []
+
+    def checked(array):
+        assert not limits or array.nbytes <= limits[-1], f"a buffer of {array} where {limits[-1]:,} bytes are the most"
+        return array
+
+    def limit(nbytes: int):
+        limits.append(nbytes)
+        monkeypatch.setattr(device, "largest_buffer_bytes", nbytes)
+
+    for name in ("empty", "upload"):
+        made = getattr(device, name)
+        monkeypatch.setattr(device, name, lambda *a, made=made, **options: checked(made(*a, **options)))
+    return limit
+
+
 @pytest.fixture(scope="module")
 def renderers(device):
     """Renderers in both kernel forms, and one of small tiles."""

@@ -349,3 +349,15 @@ def test_progress_is_told_and_may_stop(device):
     assert told[-1] == ("maps", 1.0)
     with pytest.raises(Cancelled):
         build_surfels(sphere(2000), progress=lambda stage, done: stage != "maps", device=device)
+
+
+@pytest.mark.parametrize("hybrid", [False, True])
+def test_lists_and_maps_larger_than_a_buffer(device, largest_buffer, hybrid):
+    """Neighbours and normal maps are made in parts, to the same bytes."""
+    scan = uv_sphere() if hybrid else torus(20_000)
+    wanted = build_surfels(scan, map_size=8, hybrid=hybrid, device=device)
+    largest_buffer(37 * len(wanted.triangles if hybrid else scan.points))
+    assert wanted.normal_atlas.nbytes > device.largest_buffer_bytes
+    got = build_surfels(scan, map_size=8, hybrid=hybrid, device=device)
+    for name in ("positions", "radii", "normals", "normal_atlas", "children"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name))

@@ -239,9 +239,7 @@ def test_fit_quartics(device, lanes, monkeypatch):
 def test_point_curvature(device):
     tree, host = tree_of(2000, device, 0.002)
     surfels = quartics.fit_surfels(tree, np.full(tree.padded // 16, 0.09, np.float32))
-    out = device.empty((tree.count, 16), np.float32)
-    quartics.evaluate(surfels, tree.sorted, tree.count, tree.padded, device.upload(tree.order), out, 1)
-    rows = device.download(out)
+    rows = quartics.evaluate(surfels, tree.sorted, tree.order, tree.padded, 1)
     records = device.download(surfels.records)[device.download(surfels.balls)[3] > 0].astype(np.float64)
     for i in range(0, tree.count, 150):
         wanted = twin.point_curvature(host[:3, i], host[3:6, i], records, 1)
@@ -251,3 +249,14 @@ def test_point_curvature(device):
         np.testing.assert_allclose(got[6:10], [wanted[k] for k in ("mean", "gaussian", "k1", "k2")], rtol=1e-4,
                                    atol=2e-3)
         assert abs(got[10:13] @ wanted["direction1"]) > 0.999
+
+
+def test_values_larger_than_a_buffer(device, largest_buffer):
+    """The values of a scan's own points, and of other places, come in parts."""
+    scan = clsurf.models.torus(12000)
+    wanted = curvature(scan, device=device), curvature(scan, scan.points[:1000] * 1.01, device=device)
+    largest_buffer(40 * len(scan.points))
+    got = curvature(scan, device=device), curvature(scan, scan.points[:1000] * 1.01, device=device)
+    for one, other in zip(wanted, got, strict=True):
+        for name, values in vars(one).items():
+            np.testing.assert_array_equal(values, getattr(other, name))

@@ -159,6 +159,17 @@ def test_kernel_forms_agree(device, monkeypatch):
         np.testing.assert_allclose(other.reach, found[0].reach, rtol=1e-6)
 
 
+def test_lists_larger_than_a_buffer(device, largest_buffer):
+    """Neighbours are asked for in parts, which changes nothing: of the points themselves, and of other places."""
+    points = CLOUDS["uniform"]
+    places = np.random.default_rng(3).random((1777, 3)).astype(np.float32)
+    wanted = nearest(points, 30, device=device), nearest(points, 30, places, device)
+    largest_buffer(40 * len(points))
+    got = nearest(points, 30, device=device), nearest(points, 30, places, device)
+    for one, other in zip(wanted, got, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_noise_level(device):
     rng = np.random.default_rng(5)
     points = np.concatenate([rng.random((20000, 2)), 2e-4 * rng.normal(size=(20000, 1))], axis=1)

@@ -227,7 +227,7 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
         raise InputError("scan: expected points with some extent, got all of them at one place")
     # A power of two: scaling rounds no coordinate.
     unit, middle = 2.0 ** np.ceil(np.log2(diagonal)), box.mean(axis=0).astype(np.float32)
-    device.check_memory(points=48 * len(found.position), values=64 * len(found.position))
+    device.check_memory(points=24 * len(found.position))
     tree = build_point_tree(found.position, found.normals, middle, 1 / unit, device)
     report("points", 1.0)
     plan = _plan(tree, None if radius == "auto" else float(radius) / unit, report)
@@ -243,9 +243,8 @@ def _of_scan(scan, points, radius, report, device: Device) -> Curvature:
         local = _near_scan(tree, (points - world_middle) / unit, device)
         return _in_world(_at_positions(surfels, local, QUERY_STEPS, report), unit, world_middle)
     report("curvature", 0.0)
-    out = device.empty((tree.count, 16), np.float32)
-    evaluate(surfels, tree.sorted, tree.count, tree.padded, device.upload(tree.order), out, OWN_STEPS)
-    values = _with_mean_normals(surfels, (found.position - middle) / unit, device.download(out))
+    values = evaluate(surfels, tree.sorted, tree.order, tree.padded, OWN_STEPS)
+    values = _with_mean_normals(surfels, (found.position - middle) / unit, values)
     report("curvature", 1.0)
     return _in_world(found.spread(values), unit, world_middle)
 
@@ -319,14 +318,12 @@ def _at_positions(surfels: SurfelTree, local: NDArray, steps: int, report) -> ND
     report("curvature", 0.0)
     if count == 0:
         return np.zeros((0, 16), np.float32)
-    device.check_memory(queries=24 * count, values=64 * count)
+    device.check_memory(queries=24 * count)
     order, _, _ = morton_order(np.ascontiguousarray(local[:, :3]), device)
     padded = -(-count // BLOCK) * BLOCK
     queries = np.zeros((6, padded), np.float32)
     queries[:, :count] = local[order].T
-    out = device.empty((count, 16), np.float32)
-    evaluate(surfels, device.upload(queries), count, padded, device.upload(order), out, steps)
-    values = device.download(out)
+    values = evaluate(surfels, device.upload(queries), order, padded, steps)
     report("curvature", 1.0)
     return values
 

@@ -25,6 +25,7 @@ TINY = 100  # points of a scan whose balls may grow to hold all of it
 # points hardly show these terms, the noise in them grows a hundredfold. Part of a torus with 0.1 % noise: RMS 0.0251 to
 # 0.0233, largest error 0.35 to 0.25; inside no difference.
 RIDGE = (0.003, 0.008)
+OUT = 16  # floats a point of point_curvature.cl
 SURFEL, LEAF = 32, 24  # floats a record of fit_quartics.cl, and of a SLIM surface's leaf (build/project.py)
 
 
@@ -87,14 +88,13 @@ def spread_centers(tree: PointTree, spacing: NDArray) -> NDArray:
     return np.flatnonzero(device.download(chosen, copy=False)[:tree.count]).astype(np.int32)
 
 
-def evaluate(surfels: SurfelTree, queries: DeviceArray, count: int, stride: int, order: DeviceArray, out: DeviceArray,
-             steps: int) -> None:
-    """Write position, normal and curvature at points to the rows `order` of `out` (n, 16) float32 (point_curvature.cl).
+def evaluate(surfels: SurfelTree, queries: DeviceArray, order: NDArray, stride: int, steps: int) -> NDArray:
+    """Return position, normal and curvature (n, 16) float32 at points (point_curvature.cl), in the rows `order` (n,).
 
     Parameters
     ----------
     queries : DeviceArray
-        At least (6, stride) float32, of which `count` columns count: positions and normals; neighbours should stand
+        At least (6, stride) float32, of which n columns count: positions and normals; neighbours should stand
         together.
     steps : int
         Newton steps onto the blend first.
@@ -102,6 +102,20 @@ def evaluate(surfels: SurfelTree, queries: DeviceArray, count: int, stride: int,
     quartic = surfels.degree == DEGREE
     constants = {"DEGREE": surfels.degree, "SURFEL": SURFEL if quartic else LEAF, "RADIUS_UNITS": int(quartic),
                  "STEPS": steps}
-    surfels.device.kernel("analysis/point_curvature.cl", constants=constants)(
-        (-(-count // BLOCK),), (1,), count, stride, queries, order, surfels.records, surfels.padded, surfels.balls,
-        surfels.boxes, surfels.node_offset, surfels.top_level, out)
+    device = surfels.device
+    kernel, rows = device.kernel("analysis/point_curvature.cl", constants=constants), device.rows_at_once(4 * OUT)
+
+    def values_of(first: int, order: NDArray) -> NDArray:
+        out = device.empty((len(order), OUT), np.float32)
+        kernel((-(-len(order) // BLOCK),), (1,), len(order), first // BLOCK, stride, queries, device.upload(order),
+               surfels.records, surfels.padded, surfels.balls, surfels.boxes, surfels.node_offset, surfels.top_level,
+               out)
+        return device.download(out)
+
+    if len(order) <= rows:
+        return values_of(0, order)
+    values = np.empty((len(order), OUT), np.float32)
+    for first in range(0, len(order), rows):
+        own = order[first:first + rows]
+        values[own] = values_of(first, np.arange(len(own), dtype=np.int32))
+    return values

@@ -5,6 +5,7 @@ work-item answers 16 neighbouring queries at once, its lanes. The search is exac
 tune.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -228,10 +229,29 @@ def nearest(points, k, queries=None, device=None) -> tuple[NDArray, NDArray]:
         No points, NaN among them, or k out of range.
     """
     tree = points if isinstance(points, BoxTree) else box_tree(points, device)
-    device = tree.device
     _check_k(k)
     asked = _own_queries(tree) if queries is None else _other_queries(tree, queries)
-    device.check_memory(neighbours=8 * k * asked.count)
+    rows = tree.device.rows_at_once(4 * k, 4 * k)
+    if asked.count <= rows:
+        return _nearest(tree, asked, k)
+    indices, distances = np.empty((asked.count, k), np.int32), np.empty((asked.count, k), np.float32)
+    for order, part in _parts(tree.device, asked, rows):
+        indices[order], distances[order] = _nearest(tree, part, k)
+    return indices, distances
+
+
+def _parts(device, asked: _Queries, rows: int) -> Iterator[tuple[NDArray, _Queries]]:
+    """Yield where results go, and queries whose results stand one after the other: at most `rows`, whole blocks."""
+    order, starts = device.download(asked.order), device.download(asked.starts)
+    for first in range(0, asked.count, rows):
+        own, part = order[first:first + rows], slice(first // WIDTH, (first + rows) // WIDTH)
+        blocks = device.upload(device.download(asked.blocks, copy=False)[part])
+        places = device.upload(np.arange(len(own), dtype=np.uint32))
+        yield own, _Queries(blocks, places, device.upload(starts[part]), len(own))
+
+
+def _nearest(tree: BoxTree, asked: _Queries, k: int) -> tuple[NDArray, NDArray]:
+    device = tree.device
     indices, distances = device.empty((asked.count, k), np.int32), device.empty((asked.count, k), np.float32)
     device.kernel("build/knn_indices.cl", constants={"VW": device.lanes, "CHUNKS": -(-k // 16)})(
         (-(-asked.count // device.lanes),), _local(device), tree.nodes, tree.leaves, tree.order_on_device, asked.blocks,

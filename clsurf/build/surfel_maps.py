@@ -31,8 +31,9 @@ def draw_maps(device: Device, parts: dict, inner: int, size: int, report) -> tup
     """
     n, texels = len(parts["positions"]), size * size
     hybrid, lights = parts.get("triangles") is not None, parts.get("lights")
-    device.check_memory(normal_maps=4 * inner * texels, color_maps=0 if lights is None else 4 * inner * texels,
-                        surfels=64 * n, mesh=40 * len(parts["vertices"]) if hybrid else 0)
+    device.check_memory(nodes=32 * n, lights=0 if lights is None else 16 * n, **({
+        "vertices": 12 * len(parts["vertices"]), "vertex_normals": 12 * len(parts["vertices"]),
+        "triangles": 12 * len(parts["triangles"])} if hybrid else {}))
     nodes = np.concatenate([parts["positions"], parts["spheres"][:, None], parts["normals"], parts["radii"][:, None]],
                            axis=1).astype(np.float32)
     offset = parts["child_offset"].astype(np.int64)
@@ -44,8 +45,12 @@ def draw_maps(device: Device, parts: dict, inner: int, size: int, report) -> tup
     up = lambda array, dtype=np.float32: unused if array is None else device.upload(  # noqa: E731
         np.ascontiguousarray(array, dtype))
     codes = np.rint(255 * to_srgb(np.arange(LIGHT_STEPS) / (LIGHT_STEPS - 1))).astype(np.uint8)
-    normals = device.empty((max(inner * texels, 1), 4), np.uint8)
-    colors = unused if lights is None else device.empty((max(inner * texels, 1), 4), np.uint8)
+    # Every launch has its share of the coarse surfels, whose maps see the most base surfels.
+    step = min(max(LAUNCHES, -(-4 * inner * texels // device.largest_buffer_bytes)), inner)
+    maps = -(-inner // max(step, 1))
+    device.check_memory(normal_maps=4 * maps * texels, color_maps=0 if lights is None else 4 * maps * texels)
+    normals = device.empty((max(maps * texels, 1), 4), np.uint8)
+    colors = unused if lights is None else device.empty((max(maps * texels, 1), 4), np.uint8)
     arguments = [device.upload(nodes), device.upload(below)]
     if hybrid:
         first = parts["triangle_offset"].astype(np.int64)
@@ -54,20 +59,20 @@ def draw_maps(device: Device, parts: dict, inner: int, size: int, report) -> tup
                       up(parts.get("vertex_lights"))]
     arguments += [up(lights), device.upload(codes), normals, colors]
     kernel = device.kernel("build/triangle_maps.cl" if hybrid else "build/normal_maps.cl", constants=constants)
-    # Every launch has its share of the coarse surfels, whose maps see the most base surfels.
-    step = min(LAUNCHES, max(inner, 1))
-    for part in range(step if inner else 0):
-        maps = -(-(inner - part) // step)
-        kernel((maps * (texels if device.lanes == 1 else 1),), (64,) if device.lanes == 1 else (1,), part, step, inner,
-               *arguments)
-        device.finish()
+    drawn = [np.empty((inner, texels, 4), np.uint8) for _ in range(1 if lights is None else 2)]
+    for part in range(step):
+        own = [atlas[part::step] for atlas in drawn]
+        kernel((len(own[0]) * (texels if device.lanes == 1 else 1),), (64,) if device.lanes == 1 else (1,), part, step,
+               inner, *arguments)
+        for target, found in zip(own, (normals, colors), strict=False):
+            target[...] = device.download(found, copy=False)[:len(target) * texels].reshape(target.shape)
         report((part + 1) / step)
     own = np.full((n - inner, 4), COVERED, np.uint8)
     own[:, :3] = encoded_normals(parts["normals"][inner:])
-    atlas = np.concatenate([device.download(normals, copy=False)[:inner * texels], own])
+    atlas = np.concatenate([drawn[0].reshape(-1, 4), own])
     color_atlas = None
     if lights is not None:
-        color_atlas = np.concatenate([device.download(colors, copy=False)[:inner * texels], parts["colors"][inner:]])
+        color_atlas = np.concatenate([drawn[1].reshape(-1, 4), parts["colors"][inner:]])
     sizes = np.where(np.arange(n) < inner, size, 1).astype(np.int32)
     area = sizes.astype(np.int64) ** 2
     return atlas, color_atlas, (np.cumsum(area) - area).astype(np.int32), sizes

@@ -73,15 +73,18 @@ def surfel_radii(positions: NDArray, normals: NDArray, device: Device) -> tuple[
         reach = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max() if n > 1 else 1.0
         reach = np.full(n, reach if reach > 0 else 1.0, np.float32)
         return reach, reach
-    device.check_memory(neighbours=4 * NEIGHBOURS * n, points=24 * n)
+    device.check_memory(points=12 * n, normals=12 * n)
     indices, _ = nearest(positions, min(NEIGHBOURS, n), device=device)
     if indices.shape[1] < NEIGHBOURS:
         indices = np.pad(indices, ((0, 0), (0, NEIGHBOURS - indices.shape[1])), constant_values=-1)
-    radii, spacings = device.empty((n,), np.float32), device.empty((n,), np.float32)
-    device.kernel("build/surfel_radii.cl", constants={"K": NEIGHBOURS})(
-        (n,), (64,), n, device.upload(positions), device.upload(normals), device.upload(indices), OVERLAP, radii,
-        spacings)
-    radii, spacings = device.download(radii), device.download(spacings)
+    radii, spacings = np.empty(n, np.float32), np.empty(n, np.float32)
+    kernel = device.kernel("build/surfel_radii.cl", constants={"K": NEIGHBOURS})
+    points, across, rows = device.upload(positions), device.upload(normals), device.rows_at_once(4 * NEIGHBOURS, 8)
+    for first in range(0, n, rows):
+        near = device.upload(indices[first:first + rows])
+        out = device.empty((len(near),), np.float32), device.empty((len(near),), np.float32)
+        kernel((len(near),), (64,), len(near), first, points, across, near, OVERLAP, *out)
+        radii[first:first + rows], spacings[first:first + rows] = map(device.download, out)
     lost = ~(radii > 0)  # a point with no neighbour of its own sheet
     if lost.any():
         usual = radii[~lost]

@@ -152,6 +152,15 @@ class Device:
             raise DeviceMemoryError(f"device {self.name}: {largest} needs {nbytes[largest] / 1e9:.2f} GB, one buffer "
                                     f"may have {self.largest_buffer_bytes / 1e9:.2f} GB: use a smaller scan or picture")
 
+    def rows_at_once(self, *row_bytes: int) -> int:
+        """Return how many rows of results are worth asking for at once, a multiple of 16 and at least 16.
+
+        `row_bytes` are those of a row in each buffer: every one fits into a buffer, all together take a quarter of the
+        memory, so that what they are worked out from has room beside them.
+        """
+        rows = min(self.largest_buffer_bytes // max(row_bytes), self.memory_bytes // 4 // sum(row_bytes))
+        return max(rows // 16 * 16, 16)
+
     def empty(self, shape, dtype) -> DeviceArray:
         """Return an uninitialised device array."""
         shape = (shape,) if np.isscalar(shape) else tuple(shape)

@@ -130,19 +130,19 @@ inline VF form(Blend s, Vectors a, Vectors b) {
          a.z * (s.xz * b.x + s.yz * b.y + s.zz * b.z);
 }
 
-// queries: (6, stride), positions and the normals they belong to. Point i of them is written to row `order[i]` of out; NaN
-// where no surfel reaches.
-__kernel void point_curvature(int count, int stride, __global const float *queries, __global const int *order,
-                              __global const float *surfels, int padded, __global const float *balls,
+// queries: (6, stride), positions and the normals they belong to. `count` of them, from the packet `first_packet` on, are
+// written to the rows `order` of out; NaN where no surfel reaches.
+__kernel void point_curvature(int count, int first_packet, int stride, __global const float *queries,
+                              __global const int *order, __global const float *surfels, int padded, __global const float *balls,
                               __global const float *boxes, __global const int *node_offset, int top_level,
                               __global float *out) {
   int packet = get_global_id(0);
   if (16 * packet >= count) return;
-  size_t n16 = stride / 16, first = 16 * (size_t)packet;
+  size_t n16 = stride / 16, asked = first_packet + packet, first = 16 * asked;
   VI spare = LANE_INDEX >= (VI)(count - 16 * packet); // the last packet's empty lanes repeat its first query
   VF own[6];
   for (int k = 0; k < 6; ++k)
-    own[k] = SEL(((__global const VF *)queries)[k * n16 + packet], (VF)queries[k * (size_t)stride + first], spare);
+    own[k] = SEL(((__global const VF *)queries)[k * n16 + asked], (VF)queries[k * (size_t)stride + first], spare);
   Vectors q = {own[0], own[1], own[2]}, n = {own[3], own[4], own[5]};
   Blend s;
   for (int step = 0; step <= STEPS; ++step) {
@@ -180,7 +180,7 @@ __kernel void point_curvature(int count, int stride, __global const float *queri
   int here = count - 16 * packet < 16 ? count - 16 * packet : 16;
   for (int i = 0; i < OUT; ++i) values[i] = SEL((VF)NAN, values[i], known);
   for (int j = 0; j < here; ++j) {
-    __global float *o = out + OUT * (size_t)order[first + j];
+    __global float *o = out + OUT * (size_t)order[16 * (size_t)packet + j];
     for (int i = 0; i < OUT; ++i) o[i] = ((float *)&values[i])[j];
   }
 }

@@ -31,11 +31,11 @@ INLINE void add_base(Map *m, __global const float *node, __global const float4 *
   }
 }
 
-__kernel void normal_maps(int first, int step, int count /* maps first, first + step, ... below count */,
+__kernel void normal_maps(int first, int step, int count /* maps first, first + step, ... below count, to texels one by one */,
                           __global const float *nodes, __global const int2 *below /* first child and their number */,
                           __global const float4 *lights, __global const uchar *light_codes, __global uchar4 *texels,
                           __global uchar4 *colors) {
-  int id = get_global_id(0), s = first + id / ITEMS_OF_MAP * step;
+  int id = get_global_id(0), map = id / ITEMS_OF_MAP, s = first + map * step;
   if (s >= count) return;
   Map m;
   open_map(nodes + (size_t)s * NODE_FLOATS, id % ITEMS_OF_MAP, &m);
@@ -57,5 +57,5 @@ __kernel void normal_maps(int first, int step, int count /* maps first, first + 
 #else
   float4 own = 0.0f;
 #endif
-  close_map(&m, own, light_codes, texels + (size_t)s * TEXELS, colors + (size_t)s * TEXELS);
+  close_map(&m, own, light_codes, texels + (size_t)map * TEXELS, colors + (size_t)map * TEXELS);
 }

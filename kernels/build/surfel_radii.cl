@@ -10,11 +10,12 @@
 #define LARGEST 2.0f  // spacings
 #define LEAST 0.55f
 
-__kernel void surfel_radii(int count, __global const float *points, __global const float *normals,
+// Of `count` points, the first of which is number `first`.
+__kernel void surfel_radii(int count, int first, __global const float *points, __global const float *normals,
                            __global const int *neighbours /* (count, K), the first is the point */, float overlap,
                            __global float *radii, __global float *spacings) {
-  int i = get_global_id(0);
-  if (i >= count) return;
+  int at = get_global_id(0), i = first + at;
+  if (at >= count) return;
   float3 p = vload3(i, points), n = vload3(i, normals), u, v;
   frame_of_normal(n, &u, &v);
   const float cosines[16] = {1.0f, 0.92387953f, 0.70710678f, 0.38268343f, 0.0f, -0.38268343f, -0.70710678f,
@@ -23,7 +24,7 @@ __kernel void surfel_radii(int count, __global const float *points, __global con
   float x[K], y[K], d2[K];
   int found = 0;
   for (int j = 0; j < K; j++) {
-    int other = neighbours[i * K + j];
+    int other = neighbours[(size_t)at * K + j];
     if (other < 0 || other == i) continue;
     float3 d = vload3(other, points) - p, m = vload3(other, normals);
     float a = dot(d, u), b = dot(d, v), r2 = a * a + b * b;
@@ -50,6 +51,6 @@ __kernel void surfel_radii(int count, __global const float *points, __global con
     reach = nearest > reach ? nearest : reach;
   }
   reach = reach > LEAST * spacing ? reach : LEAST * spacing;
-  radii[i] = overlap * reach;
-  spacings[i] = spacing;
+  radii[at] = overlap * reach;
+  spacings[at] = spacing;
 }
