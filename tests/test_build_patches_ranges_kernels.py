@@ -190,8 +190,9 @@ def test_range_distances(device, field, fragments, places):
         points, _, _ = host(field, device, image)
         mask = (fragments.labels == number)[field.first[image]:field.first[image + 1]].reshape(SHAPE)
         parity = np.add.outer(*map(np.arange, SHAPE)) % 2 == 0
-        expected, wider, narrower = (twin.range_distances(packed[patch], size, heights[patch].astype(float), points, mask,
-                                                          parity, reach + more) for more in (0, 1e-5, -1e-5))
+        expected, wider, narrower = (twin.range_distances(
+            packed[patch], size, heights[patch].astype(float), points, mask, parity, reach + more)
+            for more in (0, 1e-5, -1e-5))
         clear = (wider == narrower).ravel()  # elsewhere rounding decides whether the patch goes on so far
         got = np.full(mask.size, 127, np.uint8)
         got[sample[pair == k] - field.first[image]] = codes[pair == k]
