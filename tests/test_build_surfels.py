@@ -1,5 +1,6 @@
 """Surfel hierarchies: their trees, radii and normal maps."""
 
+import dataclasses
 import pickle
 
 import numpy as np
@@ -362,3 +363,24 @@ def test_lists_and_maps_larger_than_a_buffer(device, largest_buffer, monkeypatch
     got = build_surfels(scan, map_size=8, hybrid=hybrid, device=device)
     for name in ("positions", "radii", "normals", "normal_atlas", "children"):
         np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name))
+
+
+@pytest.mark.parametrize("hybrid", [False, True])
+@pytest.mark.parametrize("colored", [False, True])
+def test_maps_walked_in_parts(device, monkeypatch, hybrid, colored):
+    """A driver that ends long loops walks below one surfel after the other: the sums differ by rounding."""
+    scan = uv_sphere() if hybrid else torus(3000)
+    if colored:
+        colors = np.random.default_rng(2).integers(0, 256, (len(scan.vertices if hybrid else scan.points), 4), np.uint8)
+        scan = dataclasses.replace(scan, colors=colors)
+    monkeypatch.setattr(device, "lanes", 1)
+    wanted = build_surfels(scan, map_size=6, hybrid=hybrid, device=device)
+    walked, roots_of = [], surfel_maps.roots_of
+    monkeypatch.setattr(surfel_maps, "roots_of", lambda *a: walked.append(roots_of(*a)) or walked[-1])
+    monkeypatch.setattr(device, "loop_turns", 400 * surfel_maps.NODE_TURNS)
+    monkeypatch.setattr(device, "ended", None)
+    got = build_surfels(scan, map_size=6, hybrid=hybrid, device=device)
+    assert 4 < len(walked[0]) < 100
+    for name in ("normal_atlas", "color_atlas") if colored else ("normal_atlas",):
+        apart = np.abs(getattr(got, name).astype(int) - getattr(wanted, name))
+        assert apart.max() <= 1 and (apart > 0).mean() < 0.01

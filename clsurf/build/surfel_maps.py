@@ -12,6 +12,8 @@ from ..surface.surfel import COVERED, encoded_normals
 
 LARGEST_MAP = 64  # texels along a side: what a work-item keeps in private memory
 LIGHT_STEPS = 8192  # kernels/build/surfel_maps.clh
+SUMS = 9  # floats a texel, in surfel_maps.clh
+NODE_TURNS = 8  # of loops for each surfel or triangle that a work-item looks at, at worst
 LAUNCHES = 8  # of the maps: between them progress is told and the build may stop
 
 
@@ -40,17 +42,22 @@ def draw_maps(device: Device, parts: dict, inner: int, size: int, report) -> tup
     child = np.append(parts["children"], 0)
     below = np.stack([child[np.minimum(offset[:-1], len(child) - 1)], np.diff(offset)], axis=1).astype(np.int32)
     most, levels = int(np.diff(offset).max(initial=1)), int(parts["level"].max(initial=1))
-    constants = {"VW": device.lanes, "MAP_SIZE": size, "HAS_COLOR": lights is not None, "STACK": most * levels + 1}
+    roots = [0] if device.loop_turns is None else roots_of(parts, device.loop_turns // NODE_TURNS)
+    resumed = len(roots) > 1
+    constants = {"VW": device.lanes, "MAP_SIZE": size, "HAS_COLOR": lights is not None, "STACK": most * levels + 1,
+                 "RESUMED": resumed}
     unused = device.zeros((4,), np.float32)
     up = lambda array, dtype=np.float32: unused if array is None else device.upload(  # noqa: E731
         np.ascontiguousarray(array, dtype))
     codes = np.rint(255 * to_srgb(np.arange(LIGHT_STEPS) / (LIGHT_STEPS - 1))).astype(np.uint8)
     # Every launch has its share of the coarse surfels, whose maps see the most base surfels.
-    step = min(max(LAUNCHES, -(-4 * inner * texels // device.largest_buffer_bytes)), inner)
+    row = 4 * (SUMS if resumed else 1)
+    step = min(max(LAUNCHES, -(-row * inner * texels // device.largest_buffer_bytes)), inner)
     maps = -(-inner // max(step, 1))
-    device.check_memory(normal_maps=4 * maps * texels, color_maps=0 if lights is None else 4 * maps * texels)
+    device.check_memory(normal_maps=row * maps * texels, color_maps=0 if lights is None else 4 * maps * texels)
     normals = device.empty((max(maps * texels, 1), 4), np.uint8)
     colors = unused if lights is None else device.empty((max(maps * texels, 1), 4), np.uint8)
+    sums = device.empty((max(maps * texels, 1), SUMS), np.float32) if resumed else unused
     arguments = [device.upload(nodes), device.upload(below)]
     if hybrid:
         first = parts["triangle_offset"].astype(np.int64)
@@ -62,8 +69,11 @@ def draw_maps(device: Device, parts: dict, inner: int, size: int, report) -> tup
     drawn = [np.empty((inner, texels, 4), np.uint8) for _ in range(1 if lights is None else 2)]
     for part in range(step):
         own = [atlas[part::step] for atlas in drawn]
-        kernel((len(own[0]) * (texels if device.lanes == 1 else 1),), (64,) if device.lanes == 1 else (1,), part, step,
-               inner, *arguments)
+        if resumed:
+            device.fill(sums, 0)
+        for root in roots:
+            kernel((len(own[0]) * (texels if device.lanes == 1 else 1),), (64,) if device.lanes == 1 else (1,), part,
+                   step, inner, int(root), int(root == roots[-1]), sums, *arguments)
         for target, found in zip(own, (normals, colors), strict=False):
             target[...] = device.download(found, copy=False)[:len(target) * texels].reshape(target.shape)
         report((part + 1) / step)
@@ -76,6 +86,31 @@ def draw_maps(device: Device, parts: dict, inner: int, size: int, report) -> tup
     sizes = np.where(np.arange(n) < inner, size, 1).astype(np.int32)
     area = sizes.astype(np.int64) ** 2
     return atlas, color_atlas, (np.cumsum(area) - area).astype(np.int32), sizes
+
+
+def roots_of(parts: dict, most: int) -> list[int]:
+    """Return surfels that hold all leaves together, with at most `most` surfels and triangles below each if possible.
+
+    A driver that ends long loops walks down from each of them in a launch of its own.
+    """
+    offset, children, level = parts["child_offset"], parts["children"], parts["level"]
+    below = np.ones(len(level), np.int64)
+    if parts.get("triangles") is not None:
+        below += np.diff(parts["triangle_offset"])
+    parent = np.zeros(len(level), np.int64)
+    parent[children] = np.repeat(np.arange(len(level)), np.diff(offset))
+    for deep in range(int(level.max()), 1, -1):
+        own = np.flatnonzero(level == deep)
+        np.add.at(below, parent[own], below[own])
+    roots, waiting = [], [0]
+    while waiting:
+        root = waiting.pop()
+        own = children[offset[root]:offset[root + 1]]
+        if below[root] > most and len(own) and (below[own] > 1).all():
+            waiting.extend(own.tolist())
+        else:
+            roots.append(root)
+    return roots
 
 
 def light_of(colors: NDArray | None) -> NDArray | None:

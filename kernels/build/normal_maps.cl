@@ -32,6 +32,7 @@ INLINE void add_base(Map *m, __global const float *node, __global const float4 *
 }
 
 __kernel void normal_maps(int first, int step, int count /* maps first, first + step, ... below count, to texels one by one */,
+                          int root /* whose descendants count */, int last, __global float *sums,
                           __global const float *nodes, __global const int2 *below /* first child and their number */,
                           __global const float4 *lights, __global const uchar *light_codes, __global uchar4 *texels,
                           __global uchar4 *colors) {
@@ -39,8 +40,12 @@ __kernel void normal_maps(int first, int step, int count /* maps first, first + 
   if (s >= count) return;
   Map m;
   open_map(nodes + (size_t)s * NODE_FLOATS, id % ITEMS_OF_MAP, &m);
+#if RESUMED
+  float nearest = 0.0f;  // of triangles
+  resume_map(&m, &nearest, sums + SUMS * (size_t)id);
+#endif
   int stack[STACK], waiting = 1;
-  stack[0] = 0;
+  stack[0] = root;
   while (waiting > 0) {
     int2 children = below[stack[--waiting]];
     for (int c = children.x; c < children.x + children.y; c++) {
@@ -52,6 +57,10 @@ __kernel void normal_maps(int first, int step, int count /* maps first, first + 
       else stack[waiting++] = c;
     }
   }
+#if RESUMED
+  keep_map(&m, nearest, sums + SUMS * (size_t)id);
+  if (!last) return;
+#endif
 #if HAS_COLOR
   float4 own = lights[s];
 #else

@@ -42,6 +42,7 @@ INLINE void add_triangle(Map *m, int3 corners, __global const float *vertices, _
 }
 
 __kernel void triangle_maps(int first, int step, int count /* maps first, first + step, ... below count, to texels one by one */,
+                            int root /* whose descendants count */, int last, __global float *sums,
                             __global const float *nodes, __global const int2 *below /* first child, their number */,
                             __global const int2 *faces_below /* first triangle, their number */,
                             __global const float *vertices, __global const float *normals, __global const int *faces,
@@ -53,8 +54,11 @@ __kernel void triangle_maps(int first, int step, int count /* maps first, first 
   open_map(nodes + (size_t)s * NODE_FLOATS, id % ITEMS_OF_MAP, &m);
   VF nearest[CHUNKS];
   for (int c = 0; c < CHUNKS; c++) nearest[c] = 2.0f * m.sphere;
+#if RESUMED
+  resume_map(&m, nearest, sums + SUMS * (size_t)id);
+#endif
   int stack[STACK], waiting = 1;
-  stack[0] = 0;
+  stack[0] = root;
   while (waiting > 0) {
     int node = stack[--waiting];
     int2 own = faces_below[node], children = below[node];
@@ -66,6 +70,10 @@ __kernel void triangle_maps(int first, int step, int count /* maps first, first 
       if (dot(d, d) < reach * reach) stack[waiting++] = c;  // the bounding spheres intersect
     }
   }
+#if RESUMED
+  keep_map(&m, nearest[0], sums + SUMS * (size_t)id);
+  if (!last) return;
+#endif
 #if HAS_COLOR
   float4 own = lights[s];
 #else
