@@ -380,7 +380,8 @@ def test_maps_walked_in_parts(device, monkeypatch, hybrid, colored):
     monkeypatch.setattr(device, "loop_turns", 400 * surfel_maps.NODE_TURNS)
     monkeypatch.setattr(device, "ended", None)
     got = build_surfels(scan, map_size=6, hybrid=hybrid, device=device)
-    assert 4 < len(walked[0]) < 100
+    heavy, roots = walked[0]
+    assert 4 < len(roots) < 100 and 4 < heavy < (wanted.map_size > 1).sum()
     for name in ("normal_atlas", "color_atlas") if colored else ("normal_atlas",):
         apart = np.abs(getattr(got, name).astype(int) - getattr(wanted, name))
         assert apart.max() <= 1 and (apart > 0).mean() < 0.01
