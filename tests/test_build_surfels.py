@@ -377,8 +377,9 @@ def test_maps_walked_in_parts(device, monkeypatch, hybrid, colored):
     wanted = build_surfels(scan, map_size=6, hybrid=hybrid, device=device)
     walked, roots_of = [], surfel_maps.roots_of
     monkeypatch.setattr(surfel_maps, "roots_of", lambda *a: walked.append(roots_of(*a)) or walked[-1])
-    monkeypatch.setattr(device, "loop_turns", 400 * surfel_maps.NODE_TURNS)
-    monkeypatch.setattr(device, "ended", None)
+    if device.loop_turns is None:
+        monkeypatch.setattr(device, "loop_turns", 65535)
+    monkeypatch.setattr(surfel_maps, "NODE_TURNS", device.loop_turns // 400)
     got = build_surfels(scan, map_size=6, hybrid=hybrid, device=device)
     heavy, roots = walked[0]
     assert 4 < len(roots) < 100 and 4 < heavy < (wanted.map_size > 1).sum()
