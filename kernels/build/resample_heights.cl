@@ -1,11 +1,12 @@
-// Heights of a triangle mesh over the nodes of patches, one work-item a patch.
+// Heights of a triangle mesh over the nodes of patches, one work-item for `rows` rows of a patch of at most rows x bands.
 //
 // A patch owns the first faces of its list; the rest lie around them. A node is needed where an own face meets one of
 // the four cells around it, or comes within REACH - 1 steps of them. Its height is that of the own face above it, the
 // highest of several; beyond the own faces that of the face around which lies closest to the plane of the nearest own
 // face, if it is within GAP_LIMIT steps of it. Where there is none (at open borders and folds) the plane is carried on,
 // but only to nodes within CARRY steps of an own face, not where a nearer face around lies FALL below it, and never over
-// an edge between two vertices that `cut` marks: patches of its own follow that. Scratch: two floats a node.
+// an edge between two vertices that `cut` marks: patches of its own follow that. Scratch: two floats a node. Lists too long
+// for one launch are gone through by several, `begin` to `end` of each; the one with `last` ends the heights.
 //
 // Paper on spatial patches, section 4.1 ("can be converted to patches, since ... projected onto a plane").
 #include "build/patch_frame.clh"
@@ -80,29 +81,29 @@ inline float carried_height(const FlatTriangle *t, float area, float x, float y,
   return nz + scale * (gx * (x - nx) + gy * (y - ny));
 }
 
-__kernel void resample_heights(int patches, __global const float *frames, __global const int *size,
+__kernel void resample_heights(int patches, int rows, int bands, int begin, int end, int last, __global const float *frames, __global const int *size,
                                __global const int *node_offset, __global const int *list_offset,
                                __global const int *own_count, __global const int *list, __global const int *faces,
                                __global const float *vertices, __global const uchar *cut, __global float *distance,
                                __global float *gap, __global float *heights, __global int *source) {
-  int p = get_global_id(0);
+  int p = get_global_id(0) / bands, low = get_global_id(0) % bands * rows;
   if (p >= patches) return;
   __global const float *frame = frames + FRAME_FLOATS * (size_t)p;
-  int m = size[2 * p], n = size[2 * p + 1], first = node_offset[p];
-  for (int k = first; k < first + m * n; k++) {
+  int m = size[2 * p], n = size[2 * p + 1], first = node_offset[p], high = min(low + rows, n);
+  for (int k = first + low * m; begin == 0 && k < first + high * m; k++) {
     distance[k] = INFINITY;
     gap[k] = UNNEEDED;
     heights[k] = NAN;
     source[k] = -1;
   }
-  for (int at = list_offset[p]; at < list_offset[p + 1]; at++) {
+  for (int at = list_offset[p] + begin; at < min(list_offset[p] + end, list_offset[p + 1]); at++) {
     bool own = at < list_offset[p] + own_count[p];
     FlatTriangle t = flat_triangle(frame, vertices, faces + 3 * (size_t)list[at]);
     float area = doubled_area(&t), side = area < 0.0f ? -1.0f : 1.0f, weight[3];
     if (!own && area <= FLAT_AREA) continue;  // what faces down is another side of the surface
     __global const int *corners = faces + 3 * (size_t)list[at];
     NodeBox box = nodes_around(&t, REACH, m, n);
-    for (int j = box.j0; j <= box.j1; j++)
+    for (int j = max(box.j0, low); j <= min(box.j1, high - 1); j++)
       for (int i = box.i0; i <= box.i1; i++) {
         int k = first + j * m + i;
         float x = i, y = j;
@@ -130,7 +131,7 @@ __kernel void resample_heights(int patches, __global const float *frames, __glob
         }
       }
   }
-  for (int k = first; k < first + m * n; k++) {
+  for (int k = first + low * m; last && k < first + high * m; k++) {
     if (source[k] <= CUT) gap[k] = LOOSE;
     float z = gap[k] >= 0.0f && gap[k] < CARRIED ? distance[k] : heights[k];
     heights[k] = gap[k] == LOOSE ? NAN : frame[FRAME_STEP] * z;
