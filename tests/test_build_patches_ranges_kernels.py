@@ -155,12 +155,16 @@ def parts_of(field, device, fragments, number, rects):
     return parts
 
 
-def test_resample_ranges(device, field, fragments, places):
-    numbers = np.arange(len(fragments))
+def rects_of(field, fragments, places):
+    """Return the rects of every patch: its surroundings in its own image, then fragments of others."""
     pairs = patch_ranges.fragment_pairs(fragments, places, (9, 7))
     others = pairs[pairs[:, 1] != fragments.rects[pairs[:, 0], 0]]
-    rects = np.concatenate([patch_ranges.own_rects(field, fragments, numbers), others])
-    rects = rects[np.argsort(rects[:, 0], kind="stable")]
+    rects = np.concatenate([patch_ranges.own_rects(field, fragments, np.arange(len(fragments))), others])
+    return rects[np.argsort(rects[:, 0], kind="stable")]
+
+
+def test_resample_ranges(device, field, fragments, places):
+    numbers, rects = np.arange(len(fragments)), rects_of(field, fragments, places)
     heights, colors = patch_ranges.resampled(field, fragments, places, numbers, rects, (9, 7), device)
     packed, blended, flips = places.packed().astype(float), 0, 0
     for number in numbers:
@@ -174,6 +178,21 @@ def test_resample_ranges(device, field, fragments, places):
         assert np.abs(colors[number][both, :3] - light[both]).max(initial=0) <= 0.55
         assert (colors[number][..., 3] == 255 * np.isfinite(heights[number])).all()
     assert blended > 5 and flips <= 2  # nodes on the very rim of a cell
+
+
+def test_resampled_rect_by_rect(device, monkeypatch, field, fragments, places):
+    """Launches of one pass and a few rects each give what one launch gives."""
+    numbers, rects = np.arange(len(fragments)), rects_of(field, fragments, places)
+    wanted = patch_ranges.resampled(field, fragments, places, numbers, rects, (9, 7), device)
+    most = int(np.bincount(rects[:, 0]).max())
+    for step in (1, 2):
+        monkeypatch.setattr(patch_ranges, "_launches", lambda *_, step=step: [
+            (only, begin, min(begin + step, most), int(begin + step >= most))
+            for only in (0, 1) for begin in range(0, most, step)])
+        got = patch_ranges.resampled(field, fragments, places, numbers, rects, (9, 7), device)
+        np.testing.assert_array_equal(got[0], wanted[0])
+        np.testing.assert_array_equal(got[1], wanted[1])
+    assert most > 2 and np.isfinite(wanted[0]).sum() > 100
 
 
 def test_range_distances(device, field, fragments, places):

@@ -33,6 +33,7 @@ INSIDE = 0.6  # nodes by which a patch goes on around a sample that counts as co
 # 187 pixels of pinholes in three views; coverage 99.92 % with each.
 LOST = 0.01
 BATCH = 2048  # patches resampled at once
+CELL_TURNS = 12  # of resample_ranges.cl's loops for a cell of a rect
 BOUND_SHARE = 0.99  # of the samples within the tolerance of a patch: the share of them that the bound is given for
 LEAST_NODES = 4  # a patch whose nodes all lie on the border of its fragment would have none on it
 TRIALS, COUNT_SLACK = 4, 0.05  # where a number of patches is asked for, and how near to it is near enough
@@ -236,10 +237,22 @@ def resampled(field: RangeField, fragments: Fragments, places: Places, labels: N
                  device.upload(pairs[:, 1:]), device.upload(field.image_table[:, :3]), field.samples,
                  device.upload(field.cells), device.upload(fragments.labels),
                  device.upload(field.colors) if colored else colors, scratch, heights, colors)
+    launches = _launches(device, pairs, first)
     for start in range(0, count, batch):
         size = min(batch, count - start)
-        kernel((size,), (1,), size, start, *arguments)
+        for launch in launches:
+            kernel((size,), (1,), size, start, *launch, *arguments)
     return device.download(heights), device.download(colors) if colored else None
+
+
+def _launches(device: Device, pairs: NDArray, first: NDArray) -> list[tuple[int, int, int, int]]:
+    """Return pass, first and last rect + 1, and whether it is the pass' last, of resample_ranges.cl's launches."""
+    most = int(np.diff(first).max(initial=1))
+    if device.loop_turns is None:
+        return [(-1, 0, most, 1)]
+    step = max(device.loop_turns // (CELL_TURNS * int(pairs[:, 4:6].prod(axis=1).max(initial=1))), 1)
+    return [(only, begin, min(begin + step, most), int(begin + step >= most)) for only in (0, 1)
+            for begin in range(0, most, step)]
 
 
 def needed(field: RangeField, fragments: Fragments, places: Places, pairs: NDArray, heights: NDArray, nodes,

@@ -8,6 +8,9 @@
 // rects, 6 ints each: image, first row, first column, rows, columns, label of its cells that count (-1: of all); those of
 // patch p start at first[p]: its surroundings in its own image, then fragments of other images, the images in order.
 // images: first sample, columns, sign (1 where rows x columns face the eye, else -1).
+//
+// Drivers that end long loops get several launches for a patch: of one `only` pass (-1: both) with rects `begin` to `end`
+// of each patch, the one with `last` ends the pass.
 #include "build/patch_place.clh"
 #ifndef COLORED
 #define COLORED 0
@@ -135,7 +138,7 @@ inline void widen_reference(__global float *s, int round) {
   }
 }
 
-__kernel void resample_ranges(int count, int start, __global const float *places, __global const int *own_labels,
+__kernel void resample_ranges(int count, int start, int only, int begin, int end, int last, __global const float *places, __global const int *own_labels,
                               __global const int *first, __global const int *rects, __global const int *images,
                               __global const float4 *samples, __global const uchar *cells,
                               __global const int *labels, __global const uchar4 *colors, __global float *scratch,
@@ -146,13 +149,15 @@ __kernel void resample_ranges(int count, int start, __global const float *places
   Place place = place_of(places + PLACE * p);
   __global float *s = scratch + (long)item * PLANES * NODES;
   float xx = dot3(place.x, place.x), yy = dot3(place.y, place.y);
-  for (int at = 0; at < PLANES * NODES; at++) s[at] = 0.0f;
-  clear_image(s);
-  int own_image = rects[6 * first[p]];
+  if (only < 1 && begin == 0) {
+    for (int at = 0; at < PLANES * NODES; at++) s[at] = 0.0f;
+    clear_image(s);
+  }
+  int own_image = rects[6 * first[p]], rect_end = min(first[p] + end, first[p + 1]);
   Corner rows[2 * (STRIP + 1)];
-  for (int pass = 0; pass < 2; pass++) {  // 0: the own fragment; 1: all other cells
-    int image = -1;
-    for (int r = first[p]; r < first[p + 1]; r++) {
+  for (int pass = only == 1; pass <= (only != 0); pass++) {  // 0: the own fragment; 1: all other cells
+    int image = begin > 0 ? rects[6 * (min(first[p] + begin, rect_end) - 1)] : -1;
+    for (int r = first[p] + begin; r < rect_end; r++) {
       __global const int *rect = rects + 6 * r;
       if (!pass && rect[0] != own_image) break;
       if (pass && rect[0] != image && image >= 0) {
@@ -180,6 +185,7 @@ __kernel void resample_ranges(int count, int start, __global const float *places
         }
       }
     }
+    if (!last) return;
     if (!pass) {
       blend_image(s, 1.0f, 0);
       for (int at = 0; at < NODES; at++) {
@@ -192,6 +198,7 @@ __kernel void resample_ranges(int count, int start, __global const float *places
       blend_image(s, place.tolerance, image != own_image);
     }
   }
+  if (only == 0) return;
   for (int at = 0; at < NODES; at++) {
     float w = s[WEIGHT * NODES + at], inverse = w > 0.0f ? 1.0f / w : 0.0f;
     long to = (long)p * NODES + at;
