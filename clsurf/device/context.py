@@ -253,7 +253,7 @@ class Device:
                 for name, array in arrays.items()}
 
     def _check_loops(self) -> None:
-        """Raise DeviceError where the driver has ended a loop of a kernel before its time."""
+        """Raise DeviceMemoryError where the driver has ended a loop of a kernel before its time."""
         if self.ended is None:
             return
         told = np.empty(2, np.int32)
@@ -261,8 +261,9 @@ class Device:
         if told[1]:
             cl.enqueue_copy(self.queue, self.ended.buffer, np.zeros(2, np.int32), is_blocking=True)
             names = {name for _, name in self._kernels.__dict__ if number_of(name) == told[1]}
-            raise DeviceError(f"device {self.name}: its driver ends loops after {self.loop_turns:,} turns, too few "
-                              f"for {' '.join(names) or 'a kernel'}: use another device (clsurf devices)")
+            # As where memory does not suffice: what can be done in parts then is.
+            raise DeviceMemoryError(f"device {self.name}: its driver ends loops after {self.loop_turns:,} turns, too "
+                                    f"few for {' '.join(names) or 'a kernel'}: use another device (clsurf devices)")
 
     def keep(self, nbytes: int | None) -> int | None:
         """Keep at most `nbytes` of unused memory for reuse, or the default; return the limit before."""

@@ -185,8 +185,10 @@ def bin_pairs(device: Device, scratch: "Scratch", grid: Grid, footprints: Footpr
     bins = grid.bin_count
     order, depth_offsets = order_depths(device, scratch, footprints, count)
     # Each part of the primitives counts for itself, so more parts than workers only cost memory and scanning.
-    parts = max(1, min(4 * device.units if device.kind == "cpu" else 64 * device.units, -(-count // 256),
-                       (256 << 20) // (4 * bins)))
+    workers, least = (4 * device.units if device.kind == "cpu" else 64 * device.units), 256
+    if device.loop_turns is not None:  # the loops of a part must end by themselves
+        workers, least = 512, 128
+    parts = max(1, min(workers, -(-count // least), (256 << 20) // (4 * bins)))
     device.check_memory(bin_counts=4 * bins * parts, bin_offsets=8 * (bins + 1))
     counts = scratch.array("bin_counts", (parts, bins), np.uint32)
     offsets = scratch.array("bin_offsets", (bins + 1,), np.uint32)
