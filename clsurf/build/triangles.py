@@ -46,13 +46,9 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
     batch = max(min(BATCH, device.largest_buffer_bytes // 12 // BLOCK * BLOCK), BLOCK)
 
     def ask(rows: NDArray) -> None:
-        """Look among some triangles; in halves where the device does not hold them at once."""
+        """Look among some triangles; in halves where the device does not hold them, or look through them, at once."""
         try:
             tree = triangle_tree(corners[rows], device)
-        except DeviceMemoryError:
-            if len(rows) < 2:
-                raise
-        else:
             for start in range(0, len(points), batch):
                 part = slice(start, start + batch)
                 local = (np.asarray(points[part], np.float64) - middle) / unit
@@ -60,6 +56,9 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
                 nearer = away < found[part]
                 found[part][nearer], number[part][nearer] = away[nearer], kept[rows[at[nearer]]]
             return
+        except DeviceMemoryError:
+            if len(rows) < 2:
+                raise
         axis = int(np.argmax(np.ptp(corners[rows, 0], axis=0)))
         order = np.argpartition(corners[rows, 0, axis], len(rows) // 2)
         for half in (order[:len(rows) // 2], order[len(rows) // 2:]):
