@@ -415,13 +415,3 @@ def test_coverage_counts_what_it_says():
     found = coverage(surface, points)
     assert (found.patches, found.nodes, found.opaque) == (1, 289, 288)
     assert found.node_spacing == pytest.approx(0.1) and found.point_spacing == pytest.approx(0.05)
-
-
-def test_lists_larger_than_a_buffer(device, largest_buffer):
-    """Neighbours are found in parts; the patches are the same."""
-    points, normals = sphere(6000)
-    wanted = build_patches(PointCloud(points, normals), device=device)
-    largest_buffer(60 * len(points))
-    got = build_patches(PointCloud(points, normals), device=device)
-    np.testing.assert_array_equal(got.displacements, wanted.displacements)
-    np.testing.assert_array_equal(got.origins, wanted.origins)

@@ -5,6 +5,7 @@ import pytest
 from reference import neighbours as reference
 from scipy.spatial import cKDTree
 
+import clsurf
 from bench.answer_scenes import forms
 from clsurf.build import neighbours
 from clsurf.build.neighbours import box_tree, covariance, nearest, noise_level, sampled_covariance
@@ -168,6 +169,16 @@ def test_lists_larger_than_a_buffer(device, largest_buffer):
     got = nearest(points, 30, device=device), nearest(points, 30, places, device)
     for one, other in zip(wanted, got, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_patches_of_lists_larger_than_a_buffer(device, largest_buffer):
+    """The patches of a cloud are the same where its neighbours are found in parts."""
+    cloud = clsurf.models.sphere(6000)
+    wanted = clsurf.build_patches(cloud, device=device)
+    largest_buffer(60 * len(cloud.points))
+    got = clsurf.build_patches(cloud, device=device)
+    np.testing.assert_array_equal(got.displacements, wanted.displacements)
+    np.testing.assert_array_equal(got.origins, wanted.origins)
 
 
 def test_noise_level(device):

@@ -11,8 +11,7 @@ from ..surface.srgb import LINEAR_OF_BYTE
 
 VERTEX_COLORS, FACE_COLORS, TEXTURE = 1, 2, 3  # SOURCE of resample_colors.cl
 REACH = 1.25  # node steps, see resample_heights.cl
-ROWS = 4  # of nodes for a work-item of resample_heights.cl, where there are many units
-FACE_TURNS = 256  # of its loops for a face of two steps a side
+FACE_TURNS = 256  # of resample_heights.cl's loops for a face of two steps a side
 LEAST_ALPHA = 128  # nodes that cannot hold alpha are transparent below it
 
 
@@ -126,7 +125,7 @@ def _at_once(device, size: NDArray, lists) -> tuple[int, int]:
     if device.loop_turns is not None:  # half for the nodes, half for the faces
         rows = max(min(rows, device.loop_turns // (4 * int(size[:, 0].max()))), 1)
         return rows, max(device.loop_turns // 2 // FACE_TURNS, 1)
-    return rows if device.kind == "cpu" else ROWS, faces
+    return rows, faces
 
 
 def area_lists(owner: NDArray, count: int, corners: NDArray, rings: int = 2) -> FaceLists:

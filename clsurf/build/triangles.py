@@ -43,7 +43,7 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
     middle, unit = box.mean(axis=0), max(float(np.linalg.norm(box[1] - box[0])), np.finfo(np.float32).tiny)
     corners = (corners - middle) / unit
     found, number = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
-    batch = max(min(BATCH, device.largest_buffer_bytes // 12 // BLOCK * BLOCK), BLOCK)
+    batch = min(BATCH, device.rows_at_once(12, 4, 4))
 
     def ask(rows: NDArray) -> None:
         """Look among some triangles; in halves where the device does not hold them, or look through them, at once."""

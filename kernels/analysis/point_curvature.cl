@@ -133,9 +133,9 @@ inline VF form(Blend s, Vectors a, Vectors b) {
 // queries: (6, stride), positions and the normals they belong to. `count` of them, from the packet `first_packet` on, are
 // written to the rows `order` of out; NaN where no surfel reaches.
 __kernel void point_curvature(int count, int first_packet, int stride, __global const float *queries,
-                              __global const int *order, __global const float *surfels, int padded, __global const float *balls,
-                              __global const float *boxes, __global const int *node_offset, int top_level,
-                              __global float *out) {
+                              __global const int *order, __global const float *surfels, int padded,
+                              __global const float *balls, __global const float *boxes,
+                              __global const int *node_offset, int top_level, __global float *out) {
   int packet = get_global_id(0);
   if (16 * packet >= count) return;
   size_t n16 = stride / 16, asked = first_packet + packet, first = 16 * asked;

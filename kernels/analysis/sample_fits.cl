@@ -41,7 +41,7 @@ __kernel void sample_fits(int samples, int radii, __global const int *center, __
   solve(&sums, 10, a);
   PF sum = 0.0f;
   EACH_NEAR(PF b[TERMS]; basis_at(u, v, b); PF e = w;
-            _Pragma("unroll") for (int i = 0; i < 10; ++i) e -= a[i] * b[i];
+            for (int i = 0; i < 10; ++i) e -= a[i] * b[i];
             sum += g * e * e;)
   o[5] = sum_lanes(sum) / weight * radius * radius;
 #endif

@@ -31,8 +31,8 @@ INLINE void add_base(Map *m, __global const float *node, __global const float4 *
   }
 }
 
-__kernel void normal_maps(int first, int step, int count /* maps first, first + step, ... below count, to texels one by one */,
-                          int root /* whose descendants count */, int last, __global float *sums,
+__kernel void normal_maps(int first, int step, int count /* maps first, first + step, ... below count */,
+                          int root /* one after the other; what lies below root counts */, int last, __global float *sums,
                           __global const float *nodes, __global const int2 *below /* first child and their number */,
                           __global const float4 *lights, __global const uchar *light_codes, __global uchar4 *texels,
                           __global uchar4 *colors) {

@@ -81,7 +81,8 @@ inline float carried_height(const FlatTriangle *t, float area, float x, float y,
   return nz + scale * (gx * (x - nx) + gy * (y - ny));
 }
 
-__kernel void resample_heights(int patches, int rows, int bands, int begin, int end, int last, __global const float *frames, __global const int *size,
+__kernel void resample_heights(int patches, int rows, int bands, int begin, int end, int last,
+                               __global const float *frames, __global const int *size,
                                __global const int *node_offset, __global const int *list_offset,
                                __global const int *own_count, __global const int *list, __global const int *faces,
                                __global const float *vertices, __global const uchar *cut, __global float *distance,

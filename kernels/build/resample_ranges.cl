@@ -138,7 +138,8 @@ inline void widen_reference(__global float *s, int round) {
   }
 }
 
-__kernel void resample_ranges(int count, int start, int only, int begin, int end, int last, __global const float *places, __global const int *own_labels,
+__kernel void resample_ranges(int count, int start, int only, int begin, int end, int last,
+                              __global const float *places, __global const int *own_labels,
                               __global const int *first, __global const int *rects, __global const int *images,
                               __global const float4 *samples, __global const uchar *cells,
                               __global const int *labels, __global const uchar4 *colors, __global float *scratch,

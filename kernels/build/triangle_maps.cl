@@ -41,8 +41,8 @@ INLINE void add_triangle(Map *m, int3 corners, __global const float *vertices, _
   }
 }
 
-__kernel void triangle_maps(int first, int step, int count /* maps first, first + step, ... below count, to texels one by one */,
-                            int root /* whose descendants count */, int last, __global float *sums,
+__kernel void triangle_maps(int first, int step, int count /* maps first, first + step, ... below count */,
+                            int root /* one after the other; what lies below root counts */, int last, __global float *sums,
                             __global const float *nodes, __global const int2 *below /* first child, their number */,
                             __global const int2 *faces_below /* first triangle, their number */,
                             __global const float *vertices, __global const float *normals, __global const int *faces,
