@@ -1,6 +1,7 @@
 """What is behind everything: a colour, nothing, a gradient, the surroundings, a picture. Kernel: backdrop.cl."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from os import PathLike
 
 import numpy as np
@@ -44,6 +45,8 @@ class Backdrop:
 
 def checked_background(background, scene) -> Backdrop:
     """Return what is behind a scene, or raise InputError; see `Renderer.render`."""
+    if type(background) is tuple and all(type(part) is float for part in background):
+        return _plain(background)
     if isinstance(background, Light):
         if background.kind != "image":
             raise InputError(f"background: expected an image light, got a {background.kind} light")
@@ -66,6 +69,11 @@ def checked_background(background, scene) -> Backdrop:
                              f"got {background}") from None
         return Backdrop("gradient", ends=ends)
     return Backdrop(color=tuple(_four(background)))
+
+
+@lru_cache(maxsize=64)
+def _plain(color: tuple[float, ...]) -> Backdrop:
+    return Backdrop(color=tuple(_four(color)))  # 20 us of every frame
 
 
 def around(backdrop: Backdrop, scene) -> Backdrop:

@@ -3,6 +3,7 @@
 View space has x right, y up and looks along -z (OpenGL). Pixel (0, 0) is the top left one, its centre at (0.5, 0.5).
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -179,7 +180,7 @@ class Camera:
             return Projection(k[0, 0] * sx, k[1, 1] * sy, k[0, 2] * sx, k[1, 2] * sy, True)
         if self.height is not None:
             return Projection(height / self.height, height / self.height, width / 2, height / 2, False)
-        focal = height / (2 * np.tan(np.radians(self.fov) / 2))
+        focal = height / (2 * math.tan(math.radians(self.fov) / 2))
         return Projection(focal, focal, width / 2, height / 2, True)
 
     def rays(self, size: tuple[int, int]) -> tuple[NDArray, NDArray]:

@@ -37,5 +37,7 @@ def checked_clip(clip) -> NDArray:
 
 def view_clip(planes: NDArray, camera) -> NDArray:
     """Return the planes (n, 4) float64 in the camera's view space."""
+    if not len(planes):
+        return planes
     return np.concatenate([planes[:, :3] @ camera.rotation.T, (planes[:, :3] @ camera.eye + planes[:, 3])[:, None]],
                           axis=1)

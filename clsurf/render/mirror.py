@@ -31,7 +31,8 @@ POINT_FLOATS, SPAN = 16, 64  # kernels/render/light_points.cl
 
 def wants_mirror(scene, shading: Shading, channels) -> bool:
     """Return whether a picture shows reflections."""
-    if "color" not in channels or (scene.materials is None and np.ndim(shading.mirror) == 0 and not shading.mirror):
+    none = scene.materials is None and isinstance(shading.mirror, int | float) and not shading.mirror
+    if none or "color" not in channels:
         return False
     return bool((mirror_shares(scene, shading) > 0).any())
 

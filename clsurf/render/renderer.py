@@ -48,7 +48,7 @@ from .slim import draw_slim, upload_slim
 from .slim_drawing import SlimDrawing
 from .surfel_drawing import SurfelDrawing
 from .surfels import draw_surfels, upload_surfels
-from .tiles import BIN, Grid, Layout, Scratch, view_floats
+from .tiles import BIN, Grid, Scratch, same_layout, view_floats
 from .traced_light import light_grid
 
 # How each kind of surface is put on the device, and drawn into a grid.
@@ -300,9 +300,9 @@ class Renderer:
         # Gouraud shading puts light into the planes' colours.
         lit = patches.shading == "gouraud" and shading.look == "phong" and "color" in channels
         lit &= any(isinstance(s, PatchSurface) for s, _ in placed) and (lighting is None or lighting.plain)
-        layout = Layout(color=(colored or lit or early or unlit) and "color" in channels, id="id" in channels,
-                        count="count" in channels, level="level" in channels, lit=lit, traced=early,
-                        clip_planes=len(clip), unlit=unlit and "color" in channels, differentials=asked.curved)
+        layout = same_layout(color=(colored or lit or early or unlit) and "color" in channels, id="id" in channels,
+                             count="count" in channels, level="level" in channels, lit=lit, traced=early,
+                             clip_planes=len(clip), unlit=unlit and "color" in channels, differentials=asked.curved)
         bins, fields = -(-size[0] // BIN) * -(-size[1] // BIN), layout.constants["FIELDS"]
         pixels = size[0] * size[1]
         self.device.check_memory(planes=4 * 64 * fields * bins * (not at_once),

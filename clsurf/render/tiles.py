@@ -6,7 +6,7 @@ bin) with `bin_pairs` and writes the same planes, so that surfaces of all kinds 
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from .differentials import field_constants, plane_counts
 BIN = 8  # pixels; kernels/common/bins.clh
 VIEW_FLOATS = 64  # kernels/common/view.clh
 DEPTH_BUCKETS = 2048  # kernels/common/bins.clh
+LEAST_FLOAT = float(np.finfo(np.float32).min)
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,9 @@ class Layout:
             at += self.differential_planes
         lit = 2 if self.traced else int(self.lit or self.unlit)
         return out | {"FIELDS": at, "LIT_COLORS": lit, "CLIP_PLANES": self.clip_planes}
+
+
+same_layout = lru_cache(maxsize=256)(Layout)  # a layout with its constants takes 15 us, and every frame needs one
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +131,10 @@ def view_floats(camera, size, rotation=None, offset=None, scale=1.0, lod=0.0, de
     p = camera.projection(size)
     out = np.zeros(VIEW_FLOATS, np.float32)
     out[:9] = (camera.rotation if rotation is None else rotation).ravel()
-    out[9] = scale
-    out[10:13] = 0 if offset is None else offset
-    out[13:17] = p.fx, p.fy, p.cx, p.cy
-    out[17:22] = p.perspective, max(camera.near, np.finfo(np.float32).min), size[0], size[1], lod
-    out[22:24] = depths[0], max((depths[1] - depths[0]) / DEPTH_BUCKETS, 1e-30)
+    offset = (0.0, 0.0, 0.0) if offset is None else np.asarray(offset).tolist()
+    # One assignment of plain numbers: each takes some microseconds of every frame.
+    out[9:24] = (scale, *offset, p.fx, p.fy, p.cx, p.cy, p.perspective, max(camera.near, LEAST_FLOAT), size[0], size[1],
+                 lod, depths[0], max((depths[1] - depths[0]) / DEPTH_BUCKETS, 1e-30))
     return out
 
 
