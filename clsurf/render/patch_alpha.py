@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.patch import PatchSurface
-from .patch_mips import by_size
+from ..surface.patch import PatchSurface, by_size
 
 DIRECTIONS = [(i, j) for j in (-1, 0, 1) for i in (-1, 0, 1) if i or j]
 

@@ -4,13 +4,12 @@ The paper names mip-mapping-like filtering as future work (section 6). A level i
 same patches in the same order, so that every mode draws it.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.patch import PatchSurface, opaque_nodes
+from ..surface.patch import PatchSurface, by_size, opaque_nodes
 from ..surface.srgb import LINEAR_OF_BYTE, to_srgb
 
 OPAQUE = 1 / 8  # cover of a coarse node from which it is opaque; see `halved`
@@ -108,14 +107,6 @@ def halved(surface: PatchSurface) -> PatchSurface:
     scale = (size - 1) / (coarse - 1)
     return replace(surface, axis_x=surface.axis_x * scale[:, :1], axis_y=surface.axis_y * scale[:, 1:], size=coarse,
                    displacements=d, colors=colors)
-
-
-def by_size(surface: PatchSurface) -> Iterator[tuple[NDArray, NDArray | slice, int, int]]:
-    """Yield (patches, an index of all their nodes, m, n) for every size that patches have."""
-    for m, n in np.unique(surface.size, axis=0).astype(np.int64):
-        which = np.flatnonzero((surface.size == (m, n)).all(axis=1))
-        whole = len(which) == len(surface)
-        yield which, slice(None) if whole else (surface.node_offset[which][:, None] + np.arange(m * n)).ravel(), m, n
 
 
 def tent(nodes: int) -> NDArray:

@@ -4,6 +4,7 @@ Source: the paper on spatial patches, sections 2 and 6: a patch is an origin P, 
 m x n nodes, each a colour and a displacement d: N_ij = P + i a_x + j a_y + d_ij a_z.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -159,11 +160,25 @@ class PatchSurface:
 
     def positions(self) -> NDArray:
         """Return all nodes (N, 3) float64 in world space; transparent ones are NaN."""
-        patch, i, j = self.node_patches()
-        out = (self.origin + self.origins[patch] + i[:, None] * self.axis_x[patch].astype(np.float64)
-               + j[:, None] * self.axis_y[patch].astype(np.float64)
-               + self.displacements[:, None] * self.axis_z[patch].astype(np.float64))
+        out = self._columns().T.copy()
         out[~self.opaque] = np.nan
+        return out
+
+    def _columns(self) -> NDArray:
+        """Return all nodes, transparent ones too, as (3, N) float64, world space.
+
+        A column at a time, patches of one size by broadcasting: 562,000 nodes in 20 ms, by a patch number each 84.
+        """
+        out = np.empty((3, self.node_count))
+        x, y, z = (a.astype(np.float64) for a in (self.axis_x, self.axis_y, self.axis_z))
+        start = self.origin + self.origins
+        for which, nodes, m, n in by_size(self):
+            d = self.displacements[nodes].reshape(-1, n, m)
+            for r in range(3):
+                row = start[which, r, None, None] + np.arange(m) * x[which, r, None, None]
+                column = row + np.arange(n)[:, None] * y[which, r, None, None]
+                column += d * z[which, r, None, None]
+                out[r, nodes] = column.ravel()
         return out
 
     @cached_property
@@ -198,10 +213,11 @@ class PatchSurface:
     @cached_property
     def _box(self) -> NDArray:
         # Of 5.5 million nodes 1 s, and a scene asks for that of every placement.
-        if not self.opaque.any():
+        opaque = self.opaque
+        if not opaque.any():
             return np.full((2, 3), np.nan)
-        points = self.positions()
-        return np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)])
+        columns = [column[opaque] for column in self._columns()]
+        return np.array([[column.min() for column in columns], [column.max() for column in columns]])
 
     @property
     def nbytes(self) -> int:
@@ -221,11 +237,20 @@ class PatchSurface:
                 f"bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
 
 
+def by_size(surface: PatchSurface) -> Iterator[tuple[NDArray, NDArray | slice, int, int]]:
+    """Yield (patches, an index of all their nodes, m, n) for every size that patches have."""
+    for m, n in np.unique(surface.size, axis=0).tolist():
+        which = np.flatnonzero((surface.size == (m, n)).all(axis=1))
+        whole = len(which) == len(surface)
+        yield which, slice(None) if whole else (surface.node_offset[which][:, None] + np.arange(m * n)).ravel(), m, n
+
+
 def opaque_nodes(displacements: NDArray, colors: NDArray | None) -> NDArray:
     """Return which nodes (N,) bool show, by the rules of `PatchSurface`."""
     if colors is None:
         return displacements != np.iinfo(displacements.dtype).min
-    return colors[:, 3] > 0 if colors.shape[1] == 4 else colors.any(axis=1)
+    # any(axis=1) takes 7 times as long.
+    return colors[:, 3] > 0 if colors.shape[1] == 4 else (colors[:, 0] | colors[:, 1] | colors[:, 2]) != 0
 
 
 def facet_cones(surface: PatchSurface) -> tuple[NDArray, NDArray]:
