@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.patch import PatchSurface, by_size, opaque_nodes
+from ..surface.patch import PatchSurface, by_size, chosen_patches, opaque_nodes
 from ..surface.srgb import LINEAR_OF_BYTE, to_srgb
 
 OPAQUE = 1 / 8  # cover of a coarse node from which it is opaque; see `halved`
@@ -23,14 +23,14 @@ def mip_levels(surface: PatchSurface, most: int = 8) -> list[PatchSurface]:
     too small for a level has the one before in its place: far away it is to cover what it covers near.
     """
     levels, own = [surface], opaque_area(surface)
-    stays = (surface.size <= 2).all(axis=1)
-    while len(levels) < most and not stays.all():
-        coarse = halved(levels[-1])
-        area = opaque_area(coarse)
-        stays |= (area < KEPT * own) | (coarse.size == levels[-1].size).all(axis=1)
-        if stays.all():
-            break
-        levels.append(mixed(levels[-1], coarse, stays))
+    live = np.flatnonzero((surface.size > 2).any(axis=1))  # the patches that still become coarser
+    part = chosen_patches(surface, live)
+    while len(levels) < most and len(live):
+        coarse = halved(part)
+        goes_on = (opaque_area(coarse) >= KEPT * own[live]) & (coarse.size != part.size).any(axis=1)
+        live, part = live[goes_on], chosen_patches(coarse, np.flatnonzero(goes_on))
+        if len(live):
+            levels.append(mixed(levels[-1], part, live))
     return levels
 
 
@@ -43,25 +43,24 @@ def opaque_area(surface: PatchSurface) -> NDArray:
     return out * np.linalg.norm(np.cross(surface.axis_x.astype(np.float64), surface.axis_y), axis=1)
 
 
-def mixed(fine: PatchSurface, coarse: PatchSurface, stays: NDArray) -> PatchSurface:
-    """Return the coarse patches, with the fine ones where `stays` (p,)."""
-    if not stays.any():
+def mixed(fine: PatchSurface, coarse: PatchSurface, which: NDArray) -> PatchSurface:
+    """Return the fine patches, with the coarse ones in the places `which` (q,), ascending."""
+    if len(which) == len(fine):
         return coarse
-    counts = np.where(stays, np.diff(fine.node_offset), np.diff(coarse.node_offset))
-    patch = np.repeat(np.arange(len(fine)), counts)
-    within = np.arange(len(patch)) - np.repeat(np.cumsum(counts) - counts, counts)
-    takes = stays[patch]
-    of_fine = fine.node_offset[patch[takes]] + within[takes]
-    of_coarse = coarse.node_offset[patch[~takes]] + within[~takes]
+    takes = np.zeros(len(fine), bool)
+    takes[which] = True
+    rows = {name: getattr(fine, name).copy() for name in ("axis_x", "axis_y", "size")}
+    for name, values in rows.items():
+        values[which] = getattr(coarse, name)
+    of_fine = np.repeat(~takes, np.diff(fine.node_offset))
+    goes = np.repeat(takes, rows["size"].prod(axis=1))
 
     def nodes(a, b):
-        out = np.empty((len(patch), *a.shape[1:]), a.dtype)
-        out[takes], out[~takes] = a[of_fine], b[of_coarse]
+        out = np.empty((len(goes), *a.shape[1:]), a.dtype)
+        out[~goes], out[goes] = a[of_fine], b
         return out
-    rows = {name: np.where(stays[:, None], getattr(fine, name), getattr(coarse, name))
-            for name in ("axis_x", "axis_y", "size")}
-    return replace(coarse, **rows, displacements=nodes(fine.displacements, coarse.displacements),
-                   colors=None if coarse.colors is None else nodes(fine.colors, coarse.colors))
+    return replace(fine, **rows, displacements=nodes(fine.displacements, coarse.displacements),
+                   colors=None if fine.colors is None else nodes(fine.colors, coarse.colors))
 
 
 def with_levels(surface: PatchSurface, most: int) -> tuple[PatchSurface, int]:

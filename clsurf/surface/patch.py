@@ -5,7 +5,7 @@ m x n nodes, each a colour and a displacement d: N_ij = P + i a_x + j a_y + d_ij
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -235,6 +235,15 @@ class PatchSurface:
         sizes = f"{self.size[0, 0]} x {self.size[0, 1]}" if self.equal_sizes and len(self) else "several sizes"
         return (f"PatchSurface({len(self):,} patches of {sizes}, {self.node_count:,} nodes, {self.nbytes:,} bytes, "
                 f"bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
+
+
+def chosen_patches(surface: PatchSurface, which: NDArray) -> PatchSurface:
+    """Return the patches with the numbers `which` (q,), in that order."""
+    counts = np.diff(surface.node_offset)[which]
+    nodes = np.repeat(surface.node_offset[which] - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
+    rows = {name: getattr(surface, name)[which] for name in ("origins", "axis_x", "axis_y", "axis_z_length", "size")}
+    return replace(surface, **rows, displacements=surface.displacements[nodes],
+                   colors=None if surface.colors is None else surface.colors[nodes])
 
 
 def by_size(surface: PatchSurface) -> Iterator[tuple[NDArray, NDArray | slice, int, int]]:
