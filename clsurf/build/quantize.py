@@ -64,6 +64,6 @@ def _node_colors(colors, opaque, precise):
     if precise and out.shape[1] == 3:
         out = np.concatenate([out, np.full((len(out), 1), 255, np.uint8)], axis=1)
     if out.shape[1] == 3:
-        out[~out.any(axis=1)] = 1
-    out[~opaque] = 0
+        out |= ((out[:, 0] | out[:, 1] | out[:, 2]) == 0)[:, None]
+    out *= opaque[:, None]  # by indices, as the line before, 5 times as long
     return out

