@@ -18,6 +18,7 @@ from ..device import open_device
 from ..errors import InputError
 from ..io import load
 from ..io.stored import StoredSurface
+from ..surface.arrays import finite_rows
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -124,7 +125,7 @@ def error(surface, scan, both: bool = False, samples: int = 100_000, device=None
     if both and not (isinstance(scan, Mesh) and len(scan.faces)):
         raise InputError("both: expected a scan with faces to measure the surface's points against, got points only")
     device = open_device(device)
-    points = scan.points[np.isfinite(scan.points).all(axis=1)]
+    points = scan.points[finite_rows(scan.points)]
     if not len(points):
         raise InputError("scan: expected at least one finite point, got none")
     diagonal = float(np.linalg.norm(np.subtract(*robust_box(points))))
@@ -153,7 +154,7 @@ def _as_scan(scan) -> Mesh | PointCloud:
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError("scan: expected a Mesh, a PointCloud, a RangeScan, an array of shape (n, 3) or the path of a "
                          f"scan, got {type(scan).__name__} {'' if not points.size else points.shape}".rstrip())
-    return PointCloud(points[np.isfinite(points).all(axis=1)])
+    return PointCloud(points[finite_rows(points)])
 
 
 def distances(surface, points: NDArray, device) -> NDArray:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..build.normals import distinct
 from ..build.slim import estimated_normals, face_normals
 from ..errors import InputError
+from ..surface.arrays import finite_rows
 from ..surface.mesh import Mesh
 
 LEAST_POINTS = 6  # coefficients of a quadratic
@@ -49,7 +50,7 @@ class ScanPoints:
 def scan_points(scan, device) -> ScanPoints:
     """Return the usable points of a Mesh or PointCloud; raises InputError where fewer than 6 are left."""
     position, normals, total = scan.points, scan.normals, len(scan.points)
-    usable = np.isfinite(position).all(axis=1)
+    usable = finite_rows(position)
     if np.count_nonzero(usable) < LEAST_POINTS:
         raise InputError(f"scan: expected at least {LEAST_POINTS} finite points for a curvature, got "
                          f"{np.count_nonzero(usable)}")

@@ -11,6 +11,7 @@ from ..build.point_tree import build_point_tree
 from ..build.radius import robust_box
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
+from ..surface.arrays import finite_rows
 from ..surface.cloud import PointCloud
 from .smooth_fits import (
     LAST_STEP,
@@ -34,7 +35,7 @@ def smooth_points(cloud, strength: float, device: Device):
 
     Points that are not finite stay; points at the same place move together.
     """
-    finite = np.isfinite(cloud.points).all(axis=1)
+    finite = finite_rows(cloud.points)
     first, target = first_of_duplicates(cloud.points[finite])
     points = cloud.points[finite][first]
     if len(points) < LEAST:

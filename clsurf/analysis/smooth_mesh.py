@@ -11,6 +11,7 @@ from ..build.radius import robust_box
 from ..device import Device
 from ..device.arrays import DeviceArray
 from ..io.cleaning import first_of_duplicates
+from ..surface.arrays import finite_rows, whole_faces
 from .smooth_fits import (
     ITEMS,
     LAST_STEP,
@@ -80,9 +81,9 @@ def net_of(points: NDArray, faces: NDArray, device: Device) -> tuple[Net, NDArra
     faces = target[faces]
     a, b, c = faces.T
     good = (a != b) & (b != c) & (c != a)
-    finite = np.isfinite(points[first]).all(axis=1)
+    finite = finite_rows(points[first])
     if not finite.all():
-        good &= finite[faces].all(axis=1)
+        good &= whole_faces(faces, finite)
     faces = faces if good.all() else faces[good]
     if not len(faces):
         return None

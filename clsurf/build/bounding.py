@@ -5,6 +5,8 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import box_of, squared_lengths
+
 ROUNDS = 200  # the support changes about 10 times
 
 
@@ -15,17 +17,17 @@ def bounding_sphere(points: NDArray) -> tuple[NDArray, float]:
     until nothing sticks out by more than 1e-12 of the radius; every round the ball grows.
     """
     points = np.asarray(points, np.float64)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    middle = sum(box_of(points)) / 2
     points = points - middle
     support = points[:1]
     center, radius = support[0], 0.0
     for _ in range(ROUNDS):
-        gap = ((points - center) ** 2).sum(axis=1)
+        gap = squared_lengths(points - center)
         far = int(gap.argmax())
         if gap[far] <= (radius * (1 + 1e-12)) ** 2:
             break
         center, radius, support = _of_few(np.concatenate([support, points[far:far + 1]]))
-    gap = ((points - center) ** 2).sum(axis=1).max()
+    gap = squared_lengths(points - center).max()
     return center + middle, float(np.sqrt(gap))
 
 

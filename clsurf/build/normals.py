@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..device import open_device
 from ..errors import Cancelled, InputError
+from ..surface.arrays import extent_of
 from ..surface.cloud import PointCloud
 from ..surface.ranges import RangeScan
 from .neighbours import LARGEST_K, box_tree, covariance, sampled_covariance
@@ -113,7 +114,7 @@ def _checked_orient(cloud, orient):
         return orient
     if cloud.scanners is not None:
         return "scanners"
-    extent = np.ptp(cloud.points, axis=0) if len(cloud.points) else np.zeros(3)
+    extent = extent_of(cloud.points) if len(cloud.points) else np.zeros(3)
     flat = extent[2] < FLAT * max(extent[0], extent[1])
     return "up" if flat and LIDAR_ATTRIBUTES & set(cloud.attributes) else "graph"
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from .neighbours import bounds, nearest
+from ..surface.arrays import box_of
+from .neighbours import nearest
 
 NEIGHBOURS = 8  # nearest voxels that every voxel is compared with; 12 gained nothing
 # Weight of what the outside sees against the neighbours. 2 to 20 were measured: raw scans 1.07, 1.02 (5), 1.00 (10),
@@ -240,7 +241,7 @@ def voxel_means(points, normals, size) -> tuple[NDArray, NDArray, NDArray]:
 
 def cell_numbers(points, size) -> tuple[NDArray, int]:
     """Return the number (n,) int64 of the cubic cell of side `size` of each point, and how many cells are in use."""
-    low, high = bounds(points)
+    low, high = box_of(points)
     cells = np.minimum((points - low) * np.float32(1 / size), FARTHEST).astype(np.int64)
     spans = np.floor((high.astype(np.float64) - low) / size) + 2
     index_bits = len(points).bit_length()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io.cleaning import first_of_duplicates
+from ..surface.arrays import extent_of, finite_rows, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from .patch_edges import ALONG
@@ -56,15 +57,15 @@ def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
     InputError
         A mesh without usable faces or without extent, or a request that cannot be met.
     """
-    usable = np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all(axis=1)
+    usable = whole_faces(mesh.faces, finite_rows(mesh.vertices))
     if not usable.any():
         raise InputError("scan: expected a mesh with faces, got none with finite corners: points need method='local'")
     if not usable.all():
         mesh = _with_faces(mesh, mesh.faces[usable], np.flatnonzero(usable))
-        finite = np.isfinite(mesh.vertices).all(axis=1)  # the others have no face any more
+        finite = finite_rows(mesh.vertices)  # the others have no face any more
         mesh = replace(mesh, vertices=np.where(finite[:, None], mesh.vertices, mesh.vertices[mesh.faces[0, 0]]))
     used = mesh.vertices[mesh.faces.ravel()]
-    diagonal = float(np.linalg.norm(np.ptp(used, axis=0).astype(np.float64)))
+    diagonal = float(np.linalg.norm(extent_of(used).astype(np.float64)))
     if not diagonal > 0:
         raise InputError("scan: expected a mesh with some extent, got all corners at one place")
     spans, most = _spans(request.nodes), most_of_mesh(len(mesh.faces), request.nodes)
@@ -92,7 +93,7 @@ def converted(mesh: Mesh, request, device, progress) -> Conversion:
     spans = _spans(request.nodes)
     area = _doubled_areas(mesh).sum() / 2
     count = request.patches or max(1, round(max(len(mesh.vertices) * NODES_A_VERTEX, DEFAULT_NODES) / (m * n)))
-    extent = np.ptp(mesh.vertices[mesh.faces.ravel()], axis=0).max()  # of a needle: its area says little
+    extent = extent_of(mesh.vertices[mesh.faces.ravel()]).max()  # of a needle: its area says little
     width = request.spacing * spans.min() if request.spacing else max(math.sqrt(area / count), extent / (8 * count))
     if request.spacing:
         count = max(1, int(area / width ** 2))
@@ -198,7 +199,7 @@ def framed(graph: FaceGraph, owner: NDArray, count: int, nodes, spacing: float |
         normal = graph.normals_of(owner, count)
         box = _rectangles(graph.vertices, graph.corners, owner, count, normal, spans)
     step = ((box.high - box.low) / spans).max(axis=1)
-    least = max(np.ptp(graph.vertices, axis=0).max() * 1e-6, 1e-30)  # an area of one face without extent
+    least = max(extent_of(graph.vertices).max() * 1e-6, 1e-30)  # an area of one face without extent
     step = np.full(count, spacing, np.float64) if spacing is not None else np.maximum(step, least)
     corner = (box.low + box.high) / 2 - step[:, None] * (np.asarray(nodes) - 1) / 2
     origins = corner[:, :1] * box.axis_x + corner[:, 1:] * box.axis_y + box.height[:, None] * normal

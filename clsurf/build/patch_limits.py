@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.arrays import squared_lengths
 
 NODES_A_FACE = 256  # at most; a mesh's own resolution is about 6
 NODES_A_POINT = 64  # at most; the default is about 2
@@ -49,6 +50,6 @@ def least_width(vertices: NDArray, faces: NDArray, most: int) -> float:
     ends = [v[faces[:, k]] for k in range(3)]
     cross = np.cross(ends[1] - ends[0], ends[2] - ends[0])
     area = np.sqrt(np.einsum("ij,ij->i", cross, cross)).sum() / 2
-    longest = np.sqrt(np.max([((ends[k] - ends[k - 1]) ** 2).sum(axis=1) for k in range(3)], axis=0))
+    longest = np.sqrt(np.max([squared_lengths(ends[k] - ends[k - 1]) for k in range(3)], axis=0))
     # Needles have length without area.
     return max(float(np.sqrt(area / (FILLED * most))), float(longest.sum()) / (PIECES * most))

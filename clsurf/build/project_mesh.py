@@ -10,6 +10,7 @@ from trimesh.triangles import angles
 
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
+from ..surface.arrays import finite_rows
 from ..surface.mesh import Mesh
 from .triangles import barycentric_foot, nearest_triangles
 
@@ -60,7 +61,7 @@ def _pseudonormals(vertices, faces, face, weights) -> NDArray:
         normal[vertex] = sums[welded[face[vertex], corner]]
     # Faces without an area, and opposite ones that cancel out, have no direction: any will do.
     out = _unit(normal)
-    out[~np.isfinite(out).all(axis=1)] = (0, 0, 1)
+    out[~finite_rows(out)] = (0, 0, 1)
     return out
 
 

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
+from ..surface.arrays import finite_rows
 from ..surface.surfel import SurfelHierarchy
 from .neighbours import nearest
 from .triangles import barycentric_foot, nearest_triangles
@@ -30,7 +31,7 @@ def project_surfels(surface: SurfelHierarchy, points: NDArray, device: Device) -
 def on_discs(surface: SurfelHierarchy, points: NDArray, device: Device) -> NDArray:
     """Return (n, 7): position, normal, signed distance of `points` (n, 3) relative to the surface's origin."""
     base = surface.base
-    base = base[np.isfinite(surface.positions[base]).all(axis=1) & (surface.radii[base] > 0)]
+    base = base[finite_rows(surface.positions[base]) & (surface.radii[base] > 0)]
     if not len(base):
         raise InputError("surface: expected at least one base surfel, got none")
     positions, normals, radii = (a[base].astype(np.float64) for a in (surface.positions, surface.normals,

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..device import Device
+from ..surface.arrays import finite_rows
 from .range_fields import RangeField
 
 SPACING = 1.2  # distance between nodes over that of samples (geometric mean of both directions)
@@ -66,7 +67,7 @@ def find_fragments(field: RangeField, nodes, ratio: float, device: Device) -> Fr
             continue
         figures = fit_fragments(field, rects, trial, images, device)
         divide = _too_wide(figures, inner, ratio) & (np.array(halved) < HALVINGS)
-        good = ~divide.any(axis=1) & (figures[:, 0] >= LEAST_CELLS) & np.isfinite(figures).all(axis=1)
+        good = ~divide.any(axis=1) & (figures[:, 0] >= LEAST_CELLS) & finite_rows(figures)
         number = np.where(good, total + np.cumsum(good) - 1, -1).astype(np.int32)
         inside = np.flatnonzero(trial >= 0)
         fragment = trial[inside]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
 from ..io import load
+from ..surface.arrays import extent_of, finite_rows, squared_lengths, whole_faces
 from ..surface.cube import interpolated, texel_angles, texel_directions
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -171,8 +172,8 @@ class _Triangles:
     """A mesh on the device."""
 
     def __init__(self, mesh: Mesh, matrix: NDArray | None, device: Device):
-        finite = np.isfinite(mesh.vertices).all(axis=1)
-        kept = mesh.faces[finite[mesh.faces].all(axis=1)]
+        finite = finite_rows(mesh.vertices)
+        kept = mesh.faces[whole_faces(mesh.faces, finite)]
         if not len(kept):
             raise InputError("mesh: expected faces with finite corners, got none: build a surface from points first "
                              "(clsurf.build_slim)")
@@ -189,13 +190,13 @@ class _Triangles:
         used = np.zeros(len(world), bool)
         used[kept.ravel()] = True
         self.points = world[used]
-        self.diagonal = float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        self.diagonal = float(np.linalg.norm(extent_of(self.points)))
 
     def sphere_center(self) -> NDArray:
         return bounding_sphere(self.points)[0]
 
     def reach(self, center) -> float:
-        return float(np.sqrt(((self.points - center) ** 2).sum(axis=1).max()))
+        return float(np.sqrt(squared_lengths(self.points - center).max()))
 
     def samples(self) -> NDArray:
         """Return points (n, 3), world, evenly spread over the area, the same each time."""

@@ -18,6 +18,7 @@ from ..errors import Cancelled, DeviceMemoryError, InputError
 from ..io import load, save
 from ..io.cleaning import first_of_duplicates
 from ..sizes import parse_bytes
+from ..surface.arrays import finite_rows
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
@@ -205,7 +206,7 @@ def usable_points(scan, weight, device) -> Points:
         position, normals, colors, weights = with_middles(position, normals, colors, weights, large)
     usable = np.ones(len(position), bool)
     if not np.isfinite(position).all():
-        usable &= np.isfinite(position).all(axis=1)
+        usable &= finite_rows(position)
     if weights is not None:
         usable &= weights > 0
     if normals is None and usable.any():

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from ..device import Device
 from ..device.arrays import DeviceArray
 from ..io.cleaning import first_of_duplicates
+from ..surface.arrays import box_of
 from ..surface.cloud import PointCloud
 from ..surface.patch import PatchSurface
 from ..surface.slim import COEFFICIENTS, SlimSurface
@@ -136,8 +137,7 @@ class CellPoints:
 
     def near(self, surface: SlimSurface) -> NDArray:
         """Return which leaves of `surface` have balls that reach these points' box."""
-        low = self.position.min(axis=0) + (self.origin - surface.origin)
-        high = self.position.max(axis=0) + (self.origin - surface.origin)
+        low, high = (end + (self.origin - surface.origin) for end in box_of(self.position))
         away = np.maximum(np.maximum(low - surface.centers, surface.centers - high), 0)
         return np.flatnonzero(surface.leaf & (np.einsum("ij,ij->i", away, away) < surface.radii.astype(np.float64)**2))
 
@@ -199,7 +199,7 @@ def normals_of(points: CellPoints, plan: Plan, options: Options, coarse: Coarse,
     if options.orient == "up":
         return oriented_to(normals, np.array([0, 0, 1], np.float32))
     shift = (points.origin - plan.origin).astype(np.float32)
-    low, high = points.position.min(axis=0) + shift, points.position.max(axis=0) + shift
+    low, high = (end + shift for end in box_of(points.position))
     reach = 0.1 * (high - low).max()
     close = ((coarse.points >= low - reach) & (coarse.points <= high + reach)).all(axis=1)
     close = close if close.any() else np.ones(len(close), bool)

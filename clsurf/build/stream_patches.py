@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
+from ..surface.arrays import extent_of
 from ..surface.cloud import PointCloud
 from ..surface.patch import PatchSurface
 from .patches import PatchRequest
@@ -37,7 +38,7 @@ def build_patch_cell(position: NDArray, normals: NDArray, colors: NDArray | None
     Points that form no surface, such as a few strays, give no patches.
     """
     from .patch_local import convert
-    extent = float(np.linalg.norm(np.ptp(position, axis=0))) if len(position) else 0.0
+    extent = float(np.linalg.norm(extent_of(position))) if len(position) else 0.0
     if len(position) < 4 or not extent > 0:
         return no_patches(plan, request, colors is not None, origin), np.zeros(0, np.float32)
     asked = cell_request(request, plan, len(position), total, extent)

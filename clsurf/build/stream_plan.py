@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..device import Device
+from ..surface.arrays import extent_of
 from ..surface.slim import segment_end
 from .neighbours import box_tree
 from .normals import suitable_k
@@ -127,7 +128,7 @@ def measure(runs: Runs, diagonal: float, device: Device) -> tuple[Noise, int]:
         if len(position) < 4:
             continue
         core = (away == 0)[points.cell[first]]
-        extent = float(np.linalg.norm(np.ptp(position, axis=0))) or 1.0
+        extent = float(np.linalg.norm(extent_of(position))) or 1.0
         tree = build_point_tree(position, np.zeros_like(position), np.zeros(3, np.float32), 1 / extent, device)
         spread, reach2 = neighbour_spreads(tree, np.arange(tree.padded // BLOCK, dtype=np.int32))
         own = np.zeros(tree.padded, bool)

@@ -19,6 +19,7 @@ from ..device.arrays import give_back
 from ..io.chunks import Chunk, Source
 from ..io.colors import as_rgba8
 from ..io.files import write_array
+from ..surface.arrays import box_of
 from .neighbours import box_tree, sampled_covariance
 
 FINE = 4.0  # width of a fine cell, point spacings
@@ -70,7 +71,7 @@ class Lattice:
 
 def lattice_of(chunk: Chunk, device: Device) -> Lattice:
     """Return the lattice for a scan from its first chunk: fine cells of FINE of its point spacings."""
-    low, high = chunk.points.min(axis=0), chunk.points.max(axis=0)
+    low, high = box_of(chunk.points)
     middle = (low + high) / 2
     points = (chunk.points - middle).astype(np.float32)
     count = min(10, len(points))

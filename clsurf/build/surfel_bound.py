@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import finite_rows
 from ..surface.mesh import Mesh
 from ..surface.slim import frame_of_normals
 from .neighbours import BoxTree, box_tree, nearest
@@ -24,12 +25,12 @@ def bounds_of(scan, base: Base, device) -> tuple[float, float]:
     points = scan.points
     if isinstance(scan, Mesh) and len(scan.faces):
         points = points[np.unique(scan.faces)]  # loose vertices are no part of the surface
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     places = [evenly(points, BOUND_SAMPLES)]
     if isinstance(scan, Mesh) and len(scan.faces):
         faces = evenly(scan.faces, BOUND_SAMPLES)
         middles = scan.vertices[faces].astype(np.float64).mean(axis=1)
-        places.append(middles[np.isfinite(middles).all(axis=1)])
+        places.append(middles[finite_rows(middles)])
     tree = box_tree(base.positions, device)
     if len(base.positions) > 3:
         places.append(between(base, tree))

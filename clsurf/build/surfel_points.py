@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
+from ..surface.arrays import extent_of, finite_rows, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.srgb import premultiplied
 from .large_faces import LARGE, longest2
@@ -88,7 +89,7 @@ def surfel_radii(positions: NDArray, normals: NDArray, device: Device) -> tuple[
     lost = ~(radii > 0)  # a point with no neighbour of its own sheet
     if lost.any():
         usual = radii[~lost]
-        radii[lost] = np.median(usual) if len(usual) else np.linalg.norm(np.ptp(positions, axis=0)) / 2 or 1.0
+        radii[lost] = np.median(usual) if len(usual) else np.linalg.norm(extent_of(positions)) / 2 or 1.0
     return without_strays(radii, indices), spacings
 
 
@@ -104,8 +105,8 @@ def without_strays(radii: NDArray, indices: NDArray) -> NDArray:
 
 def sampled_mesh(mesh: Mesh, spacing) -> Mesh:
     """Return the mesh with points on its large faces as further vertices, which belong to no face."""
-    finite = np.isfinite(mesh.vertices).all(axis=1)
-    faces = mesh.faces[finite[mesh.faces].all(axis=1)]
+    finite = finite_rows(mesh.vertices)
+    faces = mesh.faces[whole_faces(mesh.faces, finite)]
     if not len(faces):
         return mesh
     corners = mesh.vertices[faces].astype(np.float64)
@@ -170,7 +171,7 @@ def thinned(positions: NDArray, normals: NDArray, colors: NDArray | None, spacin
     side = 2 * side + (normals[np.arange(len(normals)), side] < 0)
     shape = cell.max(axis=0) + 1
     if float(shape[0]) * shape[1] * shape[2] * 6 > 2.0**62:
-        raise InputError(f"spacing: expected more than {np.ptp(positions, axis=0).max() / 2**20:.3g}, got {spacing}")
+        raise InputError(f"spacing: expected more than {extent_of(positions).max() / 2**20:.3g}, got {spacing}")
     key = ((cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]) * 6 + side
     _, group = np.unique(key, return_inverse=True)
     count = np.bincount(group)

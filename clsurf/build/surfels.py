@@ -10,6 +10,7 @@ import numpy as np
 from ..device import open_device
 from ..errors import Cancelled, DeviceMemoryError, InputError
 from ..io import load
+from ..surface.arrays import finite_rows, whole_faces
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
@@ -153,8 +154,8 @@ def tree_links(tree: Tree, elements: int):
 
 def hybrid_parts(mesh: Mesh, spacing, device, report) -> tuple[dict, int]:
     """Return the fields of the hybrid form but for its maps, and the number of surfels."""
-    finite = np.isfinite(mesh.vertices).all(axis=1)
-    faces = mesh.faces[finite[mesh.faces].all(axis=1)]
+    finite = finite_rows(mesh.vertices)
+    faces = mesh.faces[whole_faces(mesh.faces, finite)]
     corners = mesh.vertices[faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(cross, axis=1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clsurf.errors import Error, FileFormatError, InputError
 
+from ..surface.arrays import finite_rows
 from .files import existing_file, one_line
 
 STREAMED = (".las", ".laz", ".ply", ".xyz", ".txt", ".asc", ".pts", ".csv")
@@ -68,7 +69,7 @@ class Source:
             if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
                 raise
             raise FileFormatError(f"{self.path}: damaged: {one_line(error)}") from None
-        keep = np.isfinite(chunk.points).all(axis=1)
+        keep = finite_rows(chunk.points)
         if chunk.normals is not None:
             with np.errstate(over="ignore", invalid="ignore"):
                 length2 = np.einsum("ij,ij->i", chunk.normals, chunk.normals)

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
+from ..surface.arrays import finite_rows
+
 log = logging.getLogger("clsurf")
 
 MIX = np.uint64(0x9E3779B97F4A7C15)  # odd, its bits look random: 2^64 over the golden ratio
@@ -44,7 +46,7 @@ def clean_scan(scan: Mesh | PointCloud, name: str = "scan") -> Mesh | PointCloud
 
 
 def _clean_cloud(scan: PointCloud, dropped: dict[str, int]) -> PointCloud:
-    keep = np.isfinite(scan.points).all(axis=1)
+    keep = finite_rows(scan.points)
     dropped["not finite"] = int(np.count_nonzero(~keep))
     normals, changed = scan.normals, False
     if normals is not None:
@@ -70,9 +72,9 @@ def _clean_cloud(scan: PointCloud, dropped: dict[str, int]) -> PointCloud:
 
 
 def _clean_mesh(scan: Mesh, dropped: dict[str, int]) -> Mesh:
-    finite = np.isfinite(scan.vertices).all(axis=1)
+    finite = finite_rows(scan.vertices)
     if scan.uv is not None:
-        finite &= np.isfinite(scan.uv).all(axis=1)
+        finite &= finite_rows(scan.uv)
     dropped["not finite"] = int(np.count_nonzero(~finite))
     rows = np.flatnonzero(finite)
     keys = scan.vertices if scan.uv is None else np.concatenate([scan.vertices, scan.uv], axis=1)
@@ -82,7 +84,7 @@ def _clean_mesh(scan: Mesh, dropped: dict[str, int]) -> Mesh:
     renumber[rows] = target
     faces = renumber[scan.faces]
     a, b, c = faces.T
-    good = (faces >= 0).all(axis=1) & (a != b) & (b != c) & (c != a)
+    good = (a >= 0) & (b >= 0) & (c >= 0) & (a != b) & (b != c) & (c != a)
     dropped["faces without three corners"] = int(np.count_nonzero(~good))
     faces = faces[good]
     used = np.zeros(len(first), bool)

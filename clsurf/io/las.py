@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clsurf.errors import FileFormatError, InputError
 from clsurf.surface.cloud import PointCloud
 
+from ..surface.arrays import box_of
 from .colors import as_rgba8
 from .files import one_line
 
@@ -105,7 +106,7 @@ def _columns(block, names: set[str], middle: NDArray, scales: NDArray) -> dict[s
 def _middle(header, block) -> NDArray:
     """Return the middle (3,) int64 of the integer lattice, from the header's box or, where that is wrong, a block."""
     lattice = np.stack([np.asarray(block[name], np.int64) for name in "XYZ"], axis=1)
-    low, high = lattice.min(axis=0), lattice.max(axis=0)
+    low, high = box_of(lattice)
     with np.errstate(all="ignore"):
         middle = ((np.asarray(header.mins) + header.maxs) / 2 - header.offsets) / header.scales
     near = np.isfinite(middle).all() and (np.abs(middle) < 2**31).all()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.arrays import finite_rows
 
 SEEN = 0.85  # of the radii of base surfels: kernels/common/surfel.clh, CORE
 
@@ -248,7 +249,7 @@ def _extent(thing, box) -> tuple[NDArray, NDArray | float]:
         return points[np.isfinite(points[:, 0])], 0.0
     if hasattr(thing, "normal_atlas") and not thing.hybrid and np.isfinite(box).all():
         base = thing.base
-        base = base[np.isfinite(thing.positions[base]).all(axis=1) & np.isfinite(thing.radii[base])]
+        base = base[finite_rows(thing.positions[base]) & np.isfinite(thing.radii[base])]
         flat = np.sqrt(np.clip(1 - thing.normals[base].astype(np.float64) ** 2, 0, 1)).max(axis=1)
         return thing.positions[base] + thing.origin, SEEN * thing.radii[base] * flat
     if hasattr(thing, "normal_atlas") and thing.hybrid:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
+from ..surface.arrays import box_of, finite_rows, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.srgb import LINEAR_OF_BYTE
 from .points import space_order
@@ -35,8 +36,8 @@ def upload_mesh(device: Device, mesh: Mesh) -> MeshUpload:
     v = len(mesh.vertices)
     device.check_memory(positions=16 * v, faces=12 * len(mesh.faces), normals=0 if mesh.normals is None else 16 * v,
                         colors=0 if mesh.colors is None else 16 * v)
-    finite = np.isfinite(mesh.vertices).all(axis=1)
-    faces = mesh.faces if finite.all() else mesh.faces[finite[mesh.faces].all(axis=1)]
+    finite = finite_rows(mesh.vertices)
+    faces = mesh.faces if finite.all() else mesh.faces[whole_faces(mesh.faces, finite)]
     faces, order = drawing_order(mesh.vertices, faces)
     put = lambda rows: device.upload(_fours(rows[order]))  # noqa: E731
     colors = None if mesh.colors is None else LINEAR_OF_BYTE[mesh.colors[:, :3]]
@@ -45,7 +46,7 @@ def upload_mesh(device: Device, mesh: Mesh) -> MeshUpload:
                           None if colors is None else put(colors), put(mesh.uv) if textured else None,
                           upload_texture(device, mesh.texture) if textured else None)
     points = mesh.vertices[order].astype(np.float64)
-    low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
+    low, high = box_of(points) if len(points) else (np.zeros(3), np.zeros(3))
     center = low / 2 + high / 2
     return MeshUpload(triangles, mesh.origin, center, float(np.linalg.norm(high - center)))
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from ..surface.arrays import box_of, finite_rows
 from ..surface.cloud import PointCloud
 from ..surface.ranges import RangeScan
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
@@ -57,7 +58,7 @@ def upload_cloud(device: Device, cloud: PointCloud | RangeScan) -> CloudUpload:
     """
     if isinstance(cloud, RangeScan):
         cloud = cloud.to_points()
-    usable = np.flatnonzero(np.isfinite(cloud.points).all(axis=1))
+    usable = np.flatnonzero(finite_rows(cloud.points))
     n = len(usable)
     runs = -(-n // RUN)
     stride = max(runs, 1) * RUN
@@ -97,8 +98,8 @@ def space_order(points: NDArray) -> NDArray:
     """Return the order (n,) of points (n, 3) float32 along a Morton curve."""
     if not len(points):
         return np.zeros(0, np.int64)
-    low = points.min(axis=0)
-    extent = max(float((points.max(axis=0) - low).max()), 1e-30)
+    low, high = box_of(points)
+    extent = max(float((high - low).max()), 1e-30)
     code = np.zeros(len(points), np.uint32)
     for axis in range(3):
         cell = ((points[:, axis] - low[axis]) * np.float32(((1 << MORTON_BITS) - 1) / extent)).astype(np.uint32)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from ..surface.arrays import box_of, finite_rows
 from ..surface.slim import SlimSurface
 from ..surface.slim_bounds import height_bounds, scaled_coefficients
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
@@ -92,7 +93,7 @@ def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
         if surface.degree >= 2:
             full[:, 4] *= 2
         low, high, slope = height_bounds(surface.degree, full)
-    usable = (np.isfinite(k).all(axis=1) & np.isfinite(centers).all(axis=1) & np.isfinite(normals).all(axis=1)
+    usable = (finite_rows(k) & finite_rows(centers) & finite_rows(normals)
               & (radius > 0) & np.isfinite(radius))
     planes = np.zeros((PLANES, stride), np.float32)
     for i, values in enumerate([*centers.T, radius, size_radius, *normals.T, low, high, slope, *k.T]):
@@ -118,7 +119,7 @@ def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
         colors[:, :3] = LINEAR_OF_BYTE[surface.colors[order, :3]]
     use = usable if usable.any() else np.zeros(n, bool)
     points = centers[use].astype(np.float64)
-    center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+    center = sum(box_of(points)) / 2 if len(points) else np.zeros(3)
     reach = float((np.linalg.norm(points - center, axis=1) + radius[use]).max()) if len(points) else 0.0
     drawn = own_radius[usable & leaf] if np.any(usable & leaf) else own_radius[usable]
     return SlimUpload(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from ..surface.arrays import box_of, finite_rows, whole_faces
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
 from ..surface.surfel import SurfelHierarchy
 from .shade import Look, Shading
@@ -65,7 +66,7 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
     device.check_memory(surfels=4 * SURFEL_FLOATS * n, normal_maps=4 * texels, levels=5 * n,
                         color_maps=0 if surface.color_atlas is None else 4 * texels,
                         colors=0 if surface.colors is None else 16 * n)
-    usable = (np.isfinite(surface.positions).all(axis=1) & np.isfinite(surface.normals).all(axis=1)
+    usable = (finite_rows(surface.positions) & finite_rows(surface.normals)
               & np.isfinite(surface.radii) & (surface.radii > 0))
     flags, state, level_end = ways_down(surface)
     records = np.zeros((n, SURFEL_FLOATS), np.float32)
@@ -81,7 +82,7 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
     whole[:, 14] = child[np.minimum(surface.child_offset[:-1], len(child) - 1)]
     whole[:, 15] = np.diff(surface.child_offset)
     points = surface.positions[usable].astype(np.float64)
-    center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+    center = sum(box_of(points)) / 2 if len(points) else np.zeros(3)
     reach = float((np.linalg.norm(points - center, axis=1) + surface.radii[usable]).max()) if len(points) else 0.0
     colors = None
     if surface.colors is not None:
@@ -127,8 +128,8 @@ def below_of(device: Device, surface: SurfelHierarchy) -> tuple:
     device.check_memory(positions=16 * len(surface.vertices), normals=16 * len(surface.vertices))
     fours = lambda rows: device.upload(np.pad(np.asarray(rows, np.float32), ((0, 0), (0, 1))))  # noqa: E731
     light = None if surface.vertex_colors is None else fours(LINEAR_OF_BYTE[surface.vertex_colors[:, :3]])
-    finite = np.isfinite(surface.vertices).all(axis=1)
-    faces = np.where(finite[surface.triangles].all(axis=1)[:, None], surface.triangles, 0)  # one vertex: not drawn
+    finite = finite_rows(surface.vertices)
+    faces = np.where(whole_faces(surface.triangles, finite)[:, None], surface.triangles, 0)  # one vertex: not drawn
     triangles = Triangles(fours(surface.vertices), device.upload(faces[:1]), fours(surface.vertex_normals), light)
     return surface.triangle_offset, faces, triangles
 

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import frozen
+from .arrays import finite_rows, frozen
 from .placed import Placed, placed
 
 FRAME_BYTES = 40  # 10 floats: origin, a_x, a_y, |a_z| (paper, section 4.3)
@@ -111,7 +111,7 @@ class PatchSurface:
         x, y = self.axis_x.astype(np.float64), self.axis_y.astype(np.float64)
         lengths = np.linalg.norm(x, axis=1) * np.linalg.norm(y, axis=1)
         across = np.abs(np.einsum("ij,ij->i", x, y))
-        wrong = ~(np.isfinite(self.origins).all(axis=1) & (lengths > 0) & (across <= 1e-4 * lengths)
+        wrong = ~(finite_rows(self.origins) & (lengths > 0) & (across <= 1e-4 * lengths)
                   & (self.axis_z_length > 0) & np.isfinite(lengths) & np.isfinite(self.axis_z_length))
         if wrong.any():
             raise ValueError(f"patch {int(np.argmax(wrong))}: expected a finite origin, perpendicular axes of positive "

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import frozen
+from .arrays import box_of, frozen
 from .cube import texel_directions
 from .placed import Placed, placed
 
@@ -144,7 +144,7 @@ class ScaleMap:
         points = self.positions()[self.valid]
         if not len(points):
             return np.full((2, 3), np.nan)
-        return np.stack([points.min(axis=0), points.max(axis=0)])
+        return np.stack(box_of(points))
 
     @property
     def nbytes(self) -> int:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import frozen
+from .arrays import box_of, frozen
 from .placed import Placed, placed
 
 COEFFICIENTS = {1: 1, 2: 6, 3: 10}  # coefficients of one surfel by degree
@@ -141,7 +141,7 @@ class SlimSurface:
         # The alpha-shrunken ball (2/3) is what carries the surface; the rest only blends.
         reach = reach * (2 / 3)
         centers = self.centers[use].astype(np.float64)
-        return np.stack([(centers - reach).min(axis=0), (centers + reach).max(axis=0)]) + self.origin
+        return np.stack([box_of(centers - reach)[0], box_of(centers + reach)[1]]) + self.origin
 
     @property
     def nbytes(self) -> int:

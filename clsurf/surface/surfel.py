@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import bounds_of, frozen
+from .arrays import bounds_of, box_of, frozen
 from .cloud import PointCloud
 from .mesh import Mesh
 from .placed import Placed, placed
@@ -173,7 +173,7 @@ class SurfelHierarchy:
             return np.full((2, 3), np.nan)
         reach = self.radii[base, None] * np.sqrt(np.clip(1 - self.normals[base].astype(np.float64) ** 2, 0, 1))
         positions = self.positions[base].astype(np.float64)
-        return np.stack([(positions - reach).min(axis=0), (positions + reach).max(axis=0)]) + self.origin
+        return np.stack([box_of(positions - reach)[0], box_of(positions + reach)[1]]) + self.origin
 
     @property
     def nbytes(self) -> int:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import DeviceMemoryError
+from ..surface.arrays import finite_rows
 from .kinds import Plan, Traced, plan_of
 
 log = logging.getLogger("clsurf")
@@ -110,7 +111,7 @@ def _halves(plan: Plan, piece: Piece, blending: bool) -> list[Piece] | None:
     low, high = plan.reaches()
     rows = piece.rows
     if rows is None:
-        rows = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1))
+        rows = np.flatnonzero(finite_rows(low) & finite_rows(high))
     if len(rows) < 2:
         return None
     middles = (low[rows] + high[rows]) / 2

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
+from ..surface.arrays import box_of, finite_rows
 from ..surface.srgb import LINEAR_OF_BYTE
 from ..surface.surfel import SurfelHierarchy
 from .kinds import NOTHING, Plan, Traced, items, register
@@ -27,7 +28,7 @@ def plan_surfels(surface: SurfelHierarchy) -> Plan:
         return replace(plan_triangles(surface.mesh, None), grain=surface.spacing,
                        colors=mesh_colors(surface.triangles, surface.vertex_colors))
     base = surface.base
-    usable = (np.isfinite(surface.positions[base]).all(axis=1) & np.isfinite(surface.normals[base]).all(axis=1)
+    usable = (finite_rows(surface.positions[base]) & finite_rows(surface.normals[base])
               & np.isfinite(surface.radii[base]) & (surface.radii[base] > 0))
     base = base[usable]
     if not len(base):
@@ -36,7 +37,7 @@ def plan_surfels(surface: SurfelHierarchy) -> Plan:
     positions, normals = surface.positions[base].astype(np.float64), surface.normals[base].astype(np.float64)
     radii = surface.radii[base].astype(np.float64)
     reach = radii[:, None] * np.sqrt(np.clip(1 - normals**2, 0, 1))
-    low, high = (positions - reach).min(axis=0), (positions + reach).max(axis=0)
+    low, high = box_of(positions - reach)[0], box_of(positions + reach)[1]
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else 1.0
     centers, reach, own = (positions - middle) / unit, reach / unit + MARGIN, radii / unit

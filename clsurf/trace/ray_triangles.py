@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
+from ..surface.arrays import box_of, finite_rows, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
@@ -71,11 +72,7 @@ def plan_triangles(mesh: Mesh, numbers: NDArray | None) -> Plan:
     numbers : (f,) int, optional
         What a hit's primitive is; by default the face. Faces with a vertex that is not finite are left out.
     """
-    finite = np.isfinite(mesh.vertices)
-    kept = np.arange(len(mesh.faces))
-    if not finite.all():
-        whole = finite.all(axis=1)[mesh.faces]
-        kept = np.flatnonzero(whole.all(axis=1))
+    kept = np.flatnonzero(whole_faces(mesh.faces, finite_rows(mesh.vertices)))
     if not len(kept):
         nothing = Traced(mesh.origin, 1.0, NOTHING, lambda *_: None)
         return Plan(lambda *_: nothing, lambda: (np.zeros((0, 3)), np.zeros((0, 3))), nothing.grain)
@@ -83,7 +80,7 @@ def plan_triangles(mesh: Mesh, numbers: NDArray | None) -> Plan:
     used = np.zeros(len(mesh.vertices), bool)
     used[faces.ravel()] = True
     points = mesh.vertices[used].astype(np.float64)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = box_of(points)
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else max(float(np.abs(middle).max()), 1.0)
     corners = ((mesh.vertices.astype(np.float64) - middle) / unit).astype(np.float32)[faces]

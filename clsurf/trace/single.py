@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
+from ..surface.arrays import finite_rows
 from .kinds import Traced
 
 RAY_FLOATS = HIT_FLOATS = 8  # kernels/trace/ray_walk.clh
@@ -51,7 +52,7 @@ def start_rays_host(origins: NDArray, directions: NDArray, nearest: NDArray, far
         enters, leaves = np.where(along, -np.inf, np.minimum(a, b)), np.where(along, np.inf, np.maximum(a, b))
         near = np.maximum(np.maximum(nearest, 0) / scale, enters.max(axis=1))
         far = np.minimum(farthest / scale, leaves.min(axis=1))
-        good = (near <= far) & ~outside & np.isfinite(d).all(axis=1) & np.isfinite(o).all(axis=1)
+        good = (near <= far) & ~outside & finite_rows(d) & finite_rows(o)
         rays = np.zeros((len(o), RAY_FLOATS), np.float32)
         rays[:, :3], rays[:, 4:7] = o + near[:, None] * d, d
         rays[:, 7] = far - near

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..io.stored_leaves import only
+from ..surface.arrays import box_of, finite_rows
 from ..surface.slim import SlimSurface
 from ..surface.slim_bounds import height_bounds, scaled_coefficients
 from ..surface.srgb import LINEAR_OF_BYTE
@@ -84,8 +85,8 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
         if degree >= 2:
             full[:, 4] *= 2
         low, high, slope = height_bounds(degree, full)
-        usable = (np.isfinite(k).all(axis=1) & np.isfinite(surface.centers).all(axis=1)
-                  & np.isfinite(surface.normals).all(axis=1) & (radii > 0) & np.isfinite(radii) & (low <= high))
+        usable = (finite_rows(k) & finite_rows(surface.centers)
+                  & finite_rows(surface.normals) & (radii > 0) & np.isfinite(radii) & (low <= high))
         below, above = piece_boxes(surface, low, high)
     below[~usable], above[~usable] = 1, -1
     tree = plant(device, below, above)
@@ -109,7 +110,7 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
         colors = np.ones((len(tree.order), 4), np.float32)
         colors[used, :3] = LINEAR_OF_BYTE[surface.colors[at, :3]]
     points = centers[at]
-    center = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+    center = sum(box_of(points)) / 2 if len(points) else np.zeros(3)
     boxes, balls = node_boxes(tree, below, above), node_boxes(tree, centers - reach, centers + reach)
     return TracedSlim(
         degree, surface.oriented, tree, device.upload(boxes), device.upload(balls),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..io.stored import StoredSurface
 from ..io.stored_leaves import StoredLeaves
+from ..surface.arrays import finite_rows
 from ..surface.placed import Placed
 from .rays import Hits
 
@@ -90,7 +91,7 @@ def trace_stored(stored: StoredSurface, matrix: NDArray | None, rays, query: str
 
     finite = np.isfinite(leaves.boxes).all(axis=(1, 2))
     whole = np.stack([leaves.boxes[finite, 0].min(axis=0), leaves.boxes[finite, 1].max(axis=0)])
-    good = np.isfinite(way.origins).all(axis=1) & np.isfinite(way.directions).all(axis=1)
+    good = finite_rows(way.origins) & finite_rows(way.directions)
     meet(whole, np.flatnonzero(good), 0)
     return out if query != "all" else _sorted(every, n, 2 * slack)
 
