@@ -19,6 +19,7 @@ from ..device import Device, open_device
 from ..errors import Cancelled, InputError
 from ..io import load
 from ..io.stored import StoredSurface
+from ..surface.arrays import lengths_of
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -287,7 +288,7 @@ def _with_mean_normals(surfels: SurfelTree, position: NDArray, values: NDArray) 
     unknown = np.flatnonzero(~known)
     index = nearest(position[known], min(AROUND, np.count_nonzero(known)), position[unknown], surfels.device)[0]
     normal = values[known][index, 3:6].mean(axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    normal /= np.maximum(lengths_of(normal, keepdims=True), 1e-30)
     local = np.concatenate([position[unknown], normal], axis=1).astype(np.float32)
     values[unknown] = _at_positions(surfels, local, OWN_STEPS, lambda *_: None)
     return values
@@ -306,7 +307,7 @@ def _near_scan(tree: PointTree, queries: NDArray, device: Device) -> NDArray:
     point, normal = host[index, :3].astype(np.float64), host[index, 3:].astype(np.float64)
     offset = queries - point
     along = offset - np.einsum("ij,ij->i", offset, normal)[:, None] * normal
-    length = np.linalg.norm(along, axis=1, keepdims=True)
+    length = lengths_of(along, keepdims=True)
     reach = 2 * float(np.median(risk.local_spacings(tree, np.unique(index // BLOCK).astype(np.int32))))
     along *= np.minimum(1, reach / np.maximum(length, 1e-30))
     return np.concatenate([point + along, normal], axis=1).astype(np.float32)

@@ -18,7 +18,7 @@ from ..device import open_device
 from ..errors import InputError
 from ..io import load
 from ..io.stored import StoredSurface
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -193,7 +193,7 @@ def surface_samples(surface, count: int, device) -> NDArray:
         return project(surface, _base_points(surface, count, random), device=device).position
     mesh = _as_mesh(surface)
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    area = np.nan_to_num(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    area = np.nan_to_num(lengths_of(np.cross(b - a, c - a)))
     if not area.sum() > 0:
         raise InputError("surface: expected faces with some area, got none")
     face = random.choice(len(area), count, p=area / area.sum())

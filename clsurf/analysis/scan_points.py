@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..build.normals import distinct
 from ..build.slim import estimated_normals, face_normals
 from ..errors import InputError
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.mesh import Mesh
 
 LEAST_POINTS = 6  # coefficients of a quadratic
@@ -77,7 +77,7 @@ def _distinct(position, normals) -> tuple[NDArray, NDArray, NDArray | None]:
     places, inverse = distinct(position)
     if inverse is None:
         return position, normals, None
-    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    unit = normals / lengths_of(normals, keepdims=True)
     sums = np.stack([np.bincount(inverse, unit[:, k], len(places)) for k in range(3)], axis=1)
     first = np.zeros(len(places), np.int64)
     first[inverse[::-1]] = np.arange(len(inverse))[::-1]

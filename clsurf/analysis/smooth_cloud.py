@@ -11,7 +11,7 @@ from ..build.point_tree import build_point_tree
 from ..build.radius import robust_box
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.cloud import PointCloud
 from .smooth_fits import (
     LAST_STEP,
@@ -66,7 +66,7 @@ def _with(cloud, points: NDArray, normals: NDArray | None):
 def usable_normals(cloud, points: NDArray, normals: NDArray | None, device: Device) -> NDArray:
     """Return unit normals (n, 3) float32 of `points`: the cloud's where all are usable, otherwise estimated ones."""
     if normals is not None:
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        length = lengths_of(normals, keepdims=True)
         if (np.isfinite(length) & (length > 1e-12)).all():
             return (normals / length).astype(np.float32)
     return estimate_normals(PointCloud(points), device=device).normals

@@ -11,7 +11,7 @@ from ..build.radius import robust_box
 from ..device import Device
 from ..device.arrays import DeviceArray
 from ..io.cleaning import first_of_duplicates
-from ..surface.arrays import finite_rows, whole_faces
+from ..surface.arrays import finite_rows, lengths_of, whole_faces
 from .smooth_fits import (
     ITEMS,
     LAST_STEP,
@@ -184,7 +184,7 @@ def guided(net: Net, guide_sharps: tuple, sharp: float) -> Guided:
     spacing = edge_length(np.maximum(area, 1e-14))
     samples = samples_of(net, rows, net.at_faces(spacing))
     normals = net.averaging @ net.device.download(rows, copy=False)[:, :3]
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    length = lengths_of(normals, keepdims=True)
     normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), (0.0, 0.0, 1.0)).astype(np.float32)
     return Guided(samples, queries_of(net.vertices, normals, net.device), sharp, spacing)
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.arrays import box_of, squared_lengths
+from ..surface.arrays import box_of, lengths_of, squared_lengths
 
 ROUNDS = 200  # the support changes about 10 times
 
@@ -41,8 +41,8 @@ def _of_few(points: NDArray) -> tuple[NDArray, float, NDArray]:
             # The centre is equally far from all and lies in their span.
             weights = np.linalg.lstsq(2 * edges @ edges.T, (edges**2).sum(axis=1), rcond=None)[0]
             center = own[0] + weights @ edges
-            radius = float(np.linalg.norm(own - center, axis=1).max())
-            if (np.linalg.norm(points - center, axis=1) <= radius * (1 + 1e-10)).all() and \
+            radius = float(lengths_of(own - center).max())
+            if (lengths_of(points - center) <= radius * (1 + 1e-10)).all() and \
                     (best is None or radius < best[1]):
                 best = center, radius, own
     return best

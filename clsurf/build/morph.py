@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..device import open_device
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from ..surface.cube import bordered, interpolated, texel_directions
 from ..surface.placed import Placed
 from ..surface.scale_map import ScaleMap, encoded, encoded_normals
@@ -89,7 +90,7 @@ def blend(parts: list[dict], weights: NDArray, bits: int | None = None) -> Scale
         for w, p in zip(weights, parts, strict=True):
             along = np.maximum((p["normals"] * d).sum(axis=-1, keepdims=True), STEEPEST)
             normals = normals + w * p["distance"][..., None] * p["normals"] / along
-        normals = encoded_normals(normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12))
+        normals = encoded_normals(normals / np.maximum(lengths_of(normals, keepdims=True), 1e-12))
     lambdas = np.where(valid, np.minimum(distance / radius, 1), 0)
     used = [p for w, p in zip(weights, parts, strict=True) if w > 0]
     bits = max(p["bits"] for p in used) if bits is None else bits
@@ -137,14 +138,14 @@ def _resampled(surface: ScaleMap, scale: float, center: NDArray, size: int) -> d
         d = texel_directions(size).reshape(-1, 3)
         if normals is not None:
             normals = interpolated(normals, valid, d)[0].reshape(6, size, size, 3)
-            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+            normals /= np.maximum(lengths_of(normals, keepdims=True), 1e-12)
         values, known = interpolated(values, valid, d)
         values, valid = values.reshape(6, size, size), known.reshape(6, size, size)
     if not valid.all() and valid.any():
         values = _without_holes(values, valid)
         if normals is not None:
             normals = _without_holes(normals, valid)
-            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+            normals /= np.maximum(lengths_of(normals, keepdims=True), 1e-12)
     share = surface.multiple_share
     return {"center": center, "radius": scale * surface.radius, "distance": scale * surface.radius * values,
             "valid": valid, "normals": normals, "bits": surface.bits, "hit": surface.hit,

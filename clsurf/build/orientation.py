@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..surface.arrays import box_of
+from ..surface.arrays import box_of, lengths_of
 from .neighbours import nearest
 
 NEIGHBOURS = 8  # nearest voxels that every voxel is compared with; 12 gained nothing
@@ -68,7 +68,7 @@ def view_directions() -> NDArray:
     """Return the unit directions (26, 3) to the corners, edges and faces of a cube; with every one its opposite."""
     steps = np.mgrid[-1:2, -1:2, -1:2].reshape(3, -1).T.astype(np.float32)
     steps = steps[np.any(steps != 0, axis=1)]
-    return steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    return steps / lengths_of(steps, keepdims=True)
 
 
 def seen_from_outside(points, normals, pixel) -> tuple[NDArray, NDArray]:
@@ -271,4 +271,4 @@ def main_axes(xx, xy, xz, yy, yz, zz) -> NDArray:
     # All columns are multiples of the eigenvector: take the longest.
     columns = np.stack([np.stack([xx, xy, xz], axis=1), np.stack([xy, yy, yz], axis=1), np.stack([xz, yz, zz], axis=1)])
     longest = columns[np.argmax(np.stack([xx, yy, zz]), axis=0), np.arange(len(xx))]
-    return longest / np.maximum(np.linalg.norm(longest, axis=1, keepdims=True), np.float32(1e-30))
+    return longest / np.maximum(lengths_of(longest, keepdims=True), np.float32(1e-30))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io.cleaning import first_of_duplicates
-from ..surface.arrays import extent_of, finite_rows, whole_faces
+from ..surface.arrays import extent_of, finite_rows, lengths_of, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from .patch_edges import ALONG
@@ -170,7 +170,7 @@ def _with_midpoints(mesh: Mesh, ends: list[NDArray]) -> Mesh:
 
 def _doubled_areas(mesh: Mesh) -> NDArray:
     v = mesh.vertices.astype(np.float64)[mesh.faces]
-    return np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]), axis=1)
+    return lengths_of(np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]))
 
 
 # Frames -------------------------------------------------------------------------------------------------------------
@@ -224,7 +224,7 @@ def _fitting(graph: FaceGraph, spans, spacing: float):
         faces = np.flatnonzero(owner >= 0)
         owner = owner[faces]
         total = sums(owner, graph.area[faces, None] * graph.normal[faces], count)
-        length = np.linalg.norm(total, axis=1, keepdims=True)
+        length = lengths_of(total, keepdims=True)
         normal = np.where(length > 0, total / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
         box = _rectangles(graph.vertices, graph.corners[faces], owner, count, normal, spans)
         return (box.high - box.low <= spans * spacing).all(axis=1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from ..surface.arrays import lengths_of
 from .segments import FaceGraph
 
 LEAST_ANGLE = 30.0  # degrees between face normals: a cell across less bulges by under 0.1 of its side
@@ -186,7 +187,7 @@ def strips_of(graph: FaceGraph, spacing: float, columns: int, along: float = ALO
     edges, vertices = sharp_edges(graph), graph.vertices
     left = graph.normal[edges.faces[:, 0]]
     right = np.where(edges.faces[:, 1:] >= 0, graph.normal[edges.faces[:, 1]], 0)
-    length = np.linalg.norm(vertices[edges.ends[:, 0]] - vertices[edges.ends[:, 1]], axis=1)
+    length = lengths_of(vertices[edges.ends[:, 0]] - vertices[edges.ends[:, 1]])
     longest = along * spacing * max(inner_columns(columns) - 1, 1)
     found = []
     for line in _long_lines(vertices, edges, length, LEAST_LINE * spacing):
@@ -228,7 +229,7 @@ def _lines(vertices, edges, use) -> list[list[tuple[int, bool]]]:
             at.setdefault(int(edges.ends[e, end]), []).append((e, end))
     border = edges.faces[:, 1] < 0
     direction = vertices[edges.ends[:, 1]] - vertices[edges.ends[:, 0]]
-    direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-300)[:, None]
+    direction /= np.maximum(lengths_of(direction), 1e-300)[:, None]
     turn = np.cos(np.radians(SHARP_TURN))
     onward = {}  # (edge, end) to the edge's continuation there
     for meeting in at.values():
@@ -305,7 +306,7 @@ def _fits(points, a, b, i, j, bend, longest) -> bool:
     if (np.einsum("ij,ij->i", offset, offset) > bend**2).any():
         return False
     half = a[i:j] + b[i:j]
-    size = np.linalg.norm(half, axis=1)
+    size = lengths_of(half)
     cosine = np.cos(np.radians(TWIST))
     return bool((half @ normal >= cosine * size).all() and (slope[0] > STEEPEST) and np.isfinite(bow).all())
 

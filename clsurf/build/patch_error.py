@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface
 
 
@@ -38,7 +39,7 @@ def patch_distances(surface: PatchSurface, patch: NDArray, points: NDArray,
     d = surface.displacements[corners].astype(np.float64)
     u, v = i - column, j - row
     miss = k - ((1 - v) * ((1 - u) * d[0] + u * d[1]) + v * ((1 - u) * d[2] + u * d[3]))
-    lengths = [np.linalg.norm(a, axis=1)[patch] for a in (x, y, z)]
+    lengths = [lengths_of(a)[patch] for a in (x, y, z)]
     upper = np.abs(miss) * lengths[2]
     slope_x = ((1 - v) * (d[1] - d[0]) + v * (d[3] - d[2])) * lengths[2] / lengths[0]
     slope_y = ((1 - u) * (d[2] - d[0]) + u * (d[3] - d[1])) * lengths[2] / lengths[1]
@@ -80,7 +81,7 @@ def _to_cells(surface, patch, local, lengths) -> NDArray:
         u, v = np.clip(local[:, 0] - column, 0, 1), np.clip(local[:, 1] - row, 0, 1)
         d = surface.displacements[corners].astype(np.float64)
         z = (1 - v) * ((1 - u) * d[0] + u * d[1]) + v * ((1 - u) * d[2] + u * d[3])
-        gap = np.linalg.norm((local - np.stack([column + u, row + v, z], axis=1)) * lengths, axis=1)
+        gap = lengths_of((local - np.stack([column + u, row + v, z], axis=1)) * lengths)
         best = np.minimum(best, np.where(opaque[corners].all(axis=0), gap, np.inf))
     return best
 
@@ -94,6 +95,6 @@ def _to_nodes(surface, patch, points) -> NDArray:
     place = (surface.origins[patch[row]].astype(np.float64) + (local % m)[:, None] * surface.axis_x[patch[row]]
              + (local // m)[:, None] * surface.axis_y[patch[row]]
              + surface.displacements[node, None] * surface.axis_z[patch[row]])
-    gap = np.linalg.norm(place - points[row], axis=1)
+    gap = lengths_of(place - points[row])
     gap[~surface.opaque[node]] = np.inf
     return np.minimum.reduceat(gap, np.cumsum(counts) - counts) if len(patch) else np.zeros(0)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ..device import Device
 from ..errors import InputError
 from ..io.cleaning import first_of_duplicates
+from ..surface.arrays import lengths_of
 from ..surface.srgb import premultiplied
 from .neighbours import BoxTree, box_tree, nearest, sampled_covariance
 from .point_tree import PointTree, build_point_tree
@@ -89,7 +90,7 @@ def sheet_points(scan, device: Device) -> SheetPoints:
     middle = box.mean(axis=0).astype(np.float32)
     tree = build_point_tree(position, normals, middle, 1.0 / diagonal, device)
     position, normals = position[tree.order], normals[tree.order]
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / lengths_of(normals, keepdims=True)
     light = None
     if colors is not None:
         light = np.zeros((4, tree.padded), np.float32)
@@ -111,7 +112,7 @@ def means(values: NDArray, target: NDArray, count: int) -> NDArray:
 
 def _unit_or(vectors: NDArray, instead: NDArray) -> NDArray:
     """Return unit vectors; where one vanishes, that of `instead`."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    length = lengths_of(vectors, keepdims=True)
     return np.where(length > 1e-3, vectors / np.maximum(length, 1e-3), instead)
 
 
@@ -139,6 +140,6 @@ def agreement(position: NDArray, normals: NDArray, neighbours: NDArray) -> float
     near = neighbours[rows, 1:]
     dot = np.einsum("ik,ijk->ij", normals[rows], normals[near])
     edge = position[near] - position[rows, None]
-    off = np.abs(np.einsum("ik,ijk->ij", normals[rows], edge)) < 0.5 * np.linalg.norm(edge, axis=2)
+    off = np.abs(np.einsum("ik,ijk->ij", normals[rows], edge)) < 0.5 * lengths_of(edge)
     clear = (near >= 0) & off & (np.abs(dot) > 0.5)
     return float((dot > 0)[clear].mean()) if clear.any() else 1.0

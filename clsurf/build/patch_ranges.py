@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from ..device import Device
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface
 from ..surface.ranges import RangeScan
 from .quantize import quantized
@@ -159,16 +160,16 @@ def places_of(field: RangeField, fragments: Fragments, nodes, ratio: float) -> P
     """Return the frames of the fragments' patches, each centred over its fragment."""
     inner = np.array([count - 1 - 2 * margin_of(count) for count in nodes])
     z, x = fragments.normal.astype(np.float64), fragments.along.astype(np.float64)
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    z /= lengths_of(z, keepdims=True)
     x -= np.einsum("ij,ij->i", x, z)[:, None] * z
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    x /= lengths_of(x, keepdims=True)
     axes = np.stack([x, np.cross(z, x), z], axis=1)
     extent = fragments.extent[:, :2].astype(np.float64)
     steps = np.maximum(np.ptp(extent, axis=2) / inner, ratio * fragments.sample_steps.min(axis=1, keepdims=True))
     start = extent.mean(axis=2) - steps * (np.array(nodes) - 1) / 2
     corner = fragments.center + start[:, :1] * axes[:, 0] + start[:, 1:] * axes[:, 1]
     image = fragments.rects[:, 0]
-    distance = np.where(field.squared[image], np.linalg.norm(fragments.center - field.eyes[image], axis=1), 1.0)
+    distance = np.where(field.squared[image], lengths_of(fragments.center - field.eyes[image]), 1.0)
     tolerance = np.maximum(TOLERANCE * np.sqrt(steps.prod(axis=1)), NOISE_TOLERANCE * field.noise[image] * distance**2)
     return Places(corner, axes, steps, tolerance)
 
@@ -195,7 +196,7 @@ def fragment_pairs(fragments: Fragments, places: Places, nodes) -> NDArray:
     half = np.ptp(extent, axis=2) / 2
     # The patch's box: its nodes, and the heights of its own fragment with those within the tolerance of them.
     box = np.column_stack([places.steps * (np.array(nodes) - 1) / 2, half[:, 2] + places.tolerance])
-    reach, radius = np.linalg.norm(box, axis=1), np.linalg.norm(half, axis=1)
+    reach, radius = lengths_of(box), lengths_of(half)
     found = []
     for ours, theirs in ((a, b) for a in _by_size(reach) for b in _by_size(radius)):
         near = cKDTree(middle[ours]).sparse_distance_matrix(

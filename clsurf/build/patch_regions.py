@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from ..surface.arrays import lengths_of
 from ..surface.slim import frame_of_normals
 from .patch_points import SheetPoints
 from .patch_seeds import FIRST, first_seeds, lloyd, renumbered
@@ -228,7 +229,7 @@ def mean_frames(sheet: Sheet, order: NDArray, label: NDArray, count: int) -> NDA
     for k in range(3):
         out[:, k] = np.bincount(label, sheet.position[order, k], count) / sizes
         out[:, 3 + k] = np.bincount(label, sheet.normals[order, k], count)
-    length = np.linalg.norm(out[:, 3:], axis=1, keepdims=True)
+    length = lengths_of(out[:, 3:], keepdims=True)
     out[:, 3:] = np.where(length > 1e-9, out[:, 3:] / np.maximum(length, 1e-9), [0, 0, 1])
     return out
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import lengths_of
 from .orientation import cell_numbers
 
 ROUNDS = 6
@@ -49,7 +50,7 @@ def seed_records(sheet, label: NDArray) -> tuple[NDArray, NDArray]:
     for k in range(3):
         out[:, k] = np.bincount(label, sheet.position[:, k], used) / sizes
         out[:, 3 + k] = np.bincount(label, sheet.normals[:, k], used)
-    length = np.linalg.norm(out[:, 3:6], axis=1, keepdims=True)
+    length = lengths_of(out[:, 3:6], keepdims=True)
     out[:, 3:6] = np.where(length > 1e-6, out[:, 3:6] / np.maximum(length, 1e-6), [0, 0, 1])
     return out, label
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from ..surface.arrays import lengths_of
 from .patch_edges import ALONG, NO_STRIPS, STEEPEST, Strips, inner_columns, shared_corners, strips_of
 from .resample import FaceLists, Frames
 from .segments import FaceGraph
@@ -72,7 +73,7 @@ def strip_frames(strips: Strips, cell: NDArray, size) -> Frames:
     along = strips.end - strips.start
     inner = inner_columns(m)
     axis_x = along / (inner - 1)
-    across = np.cross(strips.normal, along / np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None])  # to the left
+    across = np.cross(strips.normal, along / np.maximum(lengths_of(along), 1e-300)[:, None])  # to the left
     crease = strips.slope[:, 1] > 0
     width = HALF_WIDTH * cell * np.where(crease, np.maximum(strips.slope[:, 0], strips.slope[:, 1]), 1)
     ridge = np.where(crease, (n - 1) // 2, 0)
@@ -124,7 +125,7 @@ def _under(triangles, frames, p) -> NDArray:
         out &= (along.max(axis=1) >= -1.5) & (along.min(axis=1) <= nodes[p] + 0.5)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     toward = np.einsum("ij,ij->i", normal, frames.unit_z[p])
-    return out & (toward > STEEPEST / 2 * np.linalg.norm(normal, axis=1))
+    return out & (toward > STEEPEST / 2 * lengths_of(normal))
 
 
 def joined(frames: Frames, lists: FaceLists, more: Frames, their: FaceLists) -> tuple[Frames, FaceLists]:

@@ -10,7 +10,7 @@ from trimesh.triangles import angles
 
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.mesh import Mesh
 from .triangles import barycentric_foot, nearest_triangles
 
@@ -30,7 +30,7 @@ def project_mesh(mesh: Mesh, points: NDArray, device: Device) -> tuple[NDArray, 
     normal = _pseudonormals(vertices, np.asarray(mesh.faces, np.int64), face, weights)
     apart = local - foot
     side = np.where(np.einsum("ij,ij->i", apart, normal) < 0, -1.0, 1.0)
-    return foot + mesh.origin, normal, side * np.linalg.norm(apart, axis=1)
+    return foot + mesh.origin, normal, side * lengths_of(apart)
 
 
 def _pseudonormals(vertices, faces, face, weights) -> NDArray:
@@ -70,5 +70,5 @@ def _sums(rows, index, count) -> NDArray:
 
 
 def _unit(vectors) -> NDArray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    length = lengths_of(vectors, keepdims=True)
     return np.divide(vectors, length, out=np.full(vectors.shape, np.nan), where=length > 0)

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from ..surface.cube import interpolated
 from ..surface.scale_map import ScaleMap
 from ..surface.scale_mesh import scale_mesh
@@ -25,7 +26,7 @@ def project_scale_map(surface: ScaleMap, points: NDArray, device: Device) -> tup
     _, face = nearest_triangles(mesh.vertices, mesh.faces, local, device)
     corners = mesh.vertices.astype(np.float64)[mesh.faces[face]]
     foot, _ = barycentric_foot(local, corners)
-    length = np.linalg.norm(foot, axis=1, keepdims=True)
+    length = lengths_of(foot, keepdims=True)
     direction = foot / np.where(length > 0, length, 1)
     direction[length[:, 0] == 0] = (0, 0, 1)
     best = np.full(len(points), np.inf)
@@ -40,7 +41,7 @@ def project_scale_map(surface: ScaleMap, points: NDArray, device: Device) -> tup
     position = direction * best[:, None]
     apart = local - position
     side = np.where((apart * normal).sum(axis=1) < 0, -1.0, 1.0)
-    return position + surface.center, normal, side * np.linalg.norm(apart, axis=1)
+    return position + surface.center, normal, side * lengths_of(apart)
 
 
 def _radius(surface, layer, directions) -> tuple[NDArray, NDArray]:
@@ -59,4 +60,4 @@ def _normals(surface, layer, directions, rho) -> NDArray:
         ends = [np.where(known, value, rho) for value, known in ends]
         slopes.append((ends[0] - ends[1]) / (2 * np.arctan(step)))
     n = rho[:, None] * directions - slopes[0][:, None] * u - slopes[1][:, None] * v
-    return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    return n / np.maximum(lengths_of(n, keepdims=True), 1e-300)

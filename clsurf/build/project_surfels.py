@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.surfel import SurfelHierarchy
 from .neighbours import nearest
 from .triangles import barycentric_foot, nearest_triangles
@@ -46,9 +46,9 @@ def on_discs(surface: SurfelHierarchy, points: NDArray, device: Device) -> NDArr
         d = points[:, None] - p
         high = (d * n).sum(axis=2)
         flat = d - high[..., None] * n
-        length = np.linalg.norm(flat, axis=2)
+        length = lengths_of(flat)
         flat *= np.minimum(1, r / np.maximum(length, 1e-300))[..., None]
-        away = np.linalg.norm(d - flat, axis=2)
+        away = lengths_of(d - flat)
         best = np.argmin(away, axis=1)
         row = np.arange(len(points))
         q, normal = p[row, best] + flat[row, best], n[row, best]
@@ -60,16 +60,16 @@ def on_discs(surface: SurfelHierarchy, points: NDArray, device: Device) -> NDArr
             total = g.sum(axis=1)
             use = inside & (total > 1e-9)
             mean = (g[..., None] * n).sum(axis=1)
-            mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
+            mean /= np.maximum(lengths_of(mean, keepdims=True), 1e-300)
             off = (g * (e * n).sum(axis=2)).sum(axis=1) / np.maximum(total, 1e-300)
             normal = np.where(use[:, None], mean, normal)
             # Onto the blend, and below the point along the blend's normal.
             moved = q - off[:, None] * normal
             moved = points - ((points - moved) * normal).sum(axis=1, keepdims=True) * normal
-            near = np.linalg.norm(moved - q, axis=1) < r[row, best]
+            near = lengths_of(moved - q) < r[row, best]
             q = np.where((use & near)[:, None], moved, q)
     sign = np.where(((points - q) * normal).sum(axis=1) < 0, -1.0, 1.0)
-    return np.concatenate([q, normal, (sign * np.linalg.norm(points - q, axis=1))[:, None]], axis=1)
+    return np.concatenate([q, normal, (sign * lengths_of(points - q))[:, None]], axis=1)
 
 
 def on_triangles(surface: SurfelHierarchy, points: NDArray, device: Device) -> NDArray:
@@ -78,6 +78,6 @@ def on_triangles(surface: SurfelHierarchy, points: NDArray, device: Device) -> N
     index = surface.triangles[face]
     q, weights = barycentric_foot(points, surface.vertices[index].astype(np.float64))
     normal = (weights[:, :, None] * surface.vertex_normals[index]).sum(axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    normal /= np.maximum(lengths_of(normal, keepdims=True), 1e-300)
     sign = np.where(((points - q) * normal).sum(axis=1) < 0, -1.0, 1.0)
-    return np.concatenate([q, normal, (sign * np.linalg.norm(points - q, axis=1))[:, None]], axis=1)
+    return np.concatenate([q, normal, (sign * lengths_of(points - q))[:, None]], axis=1)

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface
 
 STEPS = 127  # a patch uses displacements -127...127; -128 is transparent where there are no colours
@@ -42,12 +43,12 @@ def quantized(origins: NDArray, axis_x: NDArray, axis_y: NDArray, heights: NDArr
     high = np.maximum.reduceat(np.where(opaque, heights, -np.inf), starts) if count else np.zeros(0)
     empty = ~(low <= high)
     low, high = np.where(empty, 0, low), np.where(empty, 0, high)
-    spacing = np.linalg.norm(axis_x, axis=1)
+    spacing = lengths_of(axis_x)
     steps = PRECISE_STEPS if precise else STEPS
     ratio = np.maximum((high - low) / 2 / steps / np.maximum(spacing, 1e-300), 2.0 ** -24)
     z_length = (spacing * 2.0 ** np.ceil(np.log2(ratio) - 1e-9)).astype(np.float32)
     normals = np.cross(axis_x, axis_y)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= lengths_of(normals, keepdims=True)
     middle = (low + high) / 2
     d = np.rint((np.where(opaque, heights, 0) - middle[patch]) / z_length[patch].astype(np.float64))
     kind = np.int32 if precise else np.int8

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ..device import Device, DeviceArray
+from ..surface.arrays import lengths_of
 from ..surface.ranges import RangeImage, RangeScan
 
 # Depth over width of a step between samples that is a jump: surfaces seen flatter than 11 degrees are lost with it.
@@ -213,7 +214,7 @@ def _pitch(image: RangeImage) -> tuple[NDArray, int]:
         return _scale(image) * float(middle) / np.diag(image.intrinsics)[:2], -1
     points = image.points
     right, down = (np.diff(points, axis=axis) for axis in (1, 0))
-    lengths = [np.linalg.norm(d[np.isfinite(d[..., 2])], axis=1) for d in (right, down)]
+    lengths = [lengths_of(d[np.isfinite(d[..., 2])]) for d in (right, down)]
     both = np.cross(right[:-1], down[:, :-1])
     eye = np.array([0, 0, 1.0]) if image.eye is None else image.eye - points[:-1, :-1]
     facing = np.einsum("hwi,hwi->hw", both, np.broadcast_to(eye, both.shape))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from ..surface.arrays import lengths_of
 from ..surface.mesh import Mesh
 from ..surface.srgb import LINEAR_OF_BYTE
 
@@ -36,7 +37,7 @@ class Frames:
     def unit_z(self) -> NDArray:
         """(p, 3) float64: the direction of heights."""
         z = np.cross(self.axis_x, self.axis_y)
-        return z / np.linalg.norm(z, axis=1, keepdims=True)
+        return z / lengths_of(z, keepdims=True)
 
 
 @dataclass(frozen=True)

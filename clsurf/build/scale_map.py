@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..device import Device, open_device
 from ..errors import Cancelled, InputError
 from ..io import load
-from ..surface.arrays import extent_of, finite_rows, squared_lengths, whole_faces
+from ..surface.arrays import extent_of, finite_rows, lengths_of, squared_lengths, whole_faces
 from ..surface.cube import interpolated, texel_angles, texel_directions
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -129,7 +129,7 @@ def radial_bounds(surface: ScaleMap, points: NDArray | None) -> tuple[float, flo
     if points is None or not len(points):
         return float("nan"), float("nan")
     points = points[::max(1, len(points) // 8_000)] - surface.center
-    distance = np.linalg.norm(points, axis=1)
+    distance = lengths_of(points)
     points, distance = points[distance > 0], distance[distance > 0]
     best = np.full(len(points), np.inf)
     for k in range(surface.layers):
@@ -202,7 +202,7 @@ class _Triangles:
         """Return points (n, 3), world, evenly spread over the area, the same each time."""
         corners = self.world[self.device.download(self.faces)]
         edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        ends = np.cumsum(np.linalg.norm(np.cross(edge, other), axis=1))
+        ends = np.cumsum(lengths_of(np.cross(edge, other)))
         face = np.searchsorted(ends, (np.arange(SAMPLES) + 0.5) / SAMPLES * ends[-1])
         u, v = np.random.default_rng(0).uniform(size=(2, SAMPLES, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
@@ -266,7 +266,7 @@ class _Traced:
         return self.corners.mean(axis=0)
 
     def reach(self, center) -> float:
-        return float(np.linalg.norm(self.corners - center, axis=1).max())
+        return float(lengths_of(self.corners - center).max())
 
     def samples(self) -> NDArray:
         """Return the points (n, 3), world, that rays from the middle of the box meet."""
@@ -347,7 +347,7 @@ def _seeing_center(source, hit, report) -> NDArray:
         hits = source.cast(center, sphere, VISIBLE_SIZE, 1, hit == "outermost", False)
         apart = samples - center
         there, known = interpolated(hits.distances[0], hits.distances[0] >= 0, apart)
-        return float(np.mean(known & (np.abs(there * sphere - np.linalg.norm(apart, axis=1)) < near)))
+        return float(np.mean(known & (np.abs(there * sphere - lengths_of(apart)) < near)))
 
     middle = np.asarray(source.sphere_center(), np.float64)
     box = np.stack([np.min(source.points, axis=0), np.max(source.points, axis=0)]) if source.points is not None \

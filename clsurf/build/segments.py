@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from ..surface.arrays import lengths_of
+
 # Directions that widths of areas are measured along: the axes, then the diagonals of the faces and of the cube itself.
 # Every direction is within 28 degrees of one.
 DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1],
                        [0, 1, -1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], np.float64)
-DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+DIRECTIONS /= lengths_of(DIRECTIONS, keepdims=True)
 AXES = 3  # directions that are enough while areas are small
 
 CONE = 60.0  # degrees: half the cone of a cap whose normals spread as an area's do
@@ -75,7 +77,7 @@ class FaceGraph:
     def normals_of(self, owner: NDArray, count: int) -> NDArray:
         """Return the unit mean normals (count, 3) of areas; +z where normals cancel."""
         total = sums(owner, self.area[:, None] * self.normal, count)
-        length = np.linalg.norm(total, axis=1, keepdims=True)
+        length = lengths_of(total, keepdims=True)
         return np.where(length > 0, total / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
@@ -349,7 +351,7 @@ def split_faces(corners: NDArray, vertices: NDArray, longest: float) -> tuple[ND
     place, ends = vertices, []
     done = []
     while len(faces):
-        length = np.linalg.norm(place[faces] - place[faces[:, [1, 2, 0]]], axis=2)
+        length = lengths_of(place[faces] - place[faces[:, [1, 2, 0]]])
         whole = length.max(axis=1) <= longest
         done.append((faces[whole], source[whole]))
         faces, source, length = faces[~whole], source[~whole], length[~whole]

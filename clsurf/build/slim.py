@@ -18,7 +18,7 @@ from ..errors import Cancelled, DeviceMemoryError, InputError
 from ..io import load, save
 from ..io.cleaning import first_of_duplicates
 from ..sizes import parse_bytes
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
@@ -274,7 +274,7 @@ def face_normals(points: NDArray, faces: NDArray) -> NDArray:
     rows = sparse.csr_matrix((np.ones(faces.size, np.float32), (target[faces] if split else faces).ravel(),
                               np.arange(0, faces.size + 1, 3)), shape=(len(faces), len(first)))
     normals = rows.T @ cross
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    length = lengths_of(normals, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
     if not split:
         return normals

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.mesh import Mesh
 from ..surface.slim import frame_of_normals
 from .neighbours import BoxTree, box_tree, nearest
@@ -83,7 +83,7 @@ def between(base: Base, tree: BoxTree) -> NDArray:
     weights = np.maximum(side2 * (side2.sum(axis=1, keepdims=True) - 2 * side2), 0)
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
     middle, normal = ((weights[..., None] * a).sum(axis=1) for a in (p, n))
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    normal /= np.maximum(lengths_of(normal, keepdims=True), 1e-300)
     planes = (weights * ((p - middle[:, None]) * n).sum(axis=2)).sum(axis=1)
     return middle + planes[:, None] / 2 * normal
 
@@ -102,6 +102,6 @@ def drawn_distance(places: NDArray, base: Base, tree: BoxTree) -> NDArray:
     weight = np.maximum(1 - flat * flat / (r * r), 0) ** 3
     weight *= ((n * side[:, None]).sum(axis=2) > 0) & (np.abs(high) < r)
     total = weight.sum(axis=1)
-    along = np.linalg.norm((weight[..., None] * n).sum(axis=1), axis=1)
+    along = lengths_of((weight[..., None] * n).sum(axis=1))
     blend = np.abs((weight * high).sum(axis=1)) / np.maximum(along, 1e-300)
     return np.where(total > 0, blend, disc.min(axis=1))

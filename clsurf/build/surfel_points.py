@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
-from ..surface.arrays import extent_of, finite_rows, whole_faces
+from ..surface.arrays import extent_of, finite_rows, lengths_of, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.srgb import premultiplied
 from .large_faces import LARGE, longest2
@@ -64,14 +64,14 @@ def base_surfels(scan, spacing, device: Device) -> Base:
 def unit(vectors) -> NDArray:
     """Return vectors (n, 3) float32 of length 1."""
     vectors = np.asarray(vectors, np.float64)
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    return (vectors / lengths_of(vectors, keepdims=True)).astype(np.float32)
 
 
 def surfel_radii(positions: NDArray, normals: NDArray, device: Device) -> tuple[NDArray, NDArray]:
     """Return radii (n,) float32 that leave no hole, and the distance to neighbours (n,) float32 around each point."""
     n = len(positions)
     if n < 4:
-        reach = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max() if n > 1 else 1.0
+        reach = lengths_of(positions - positions.mean(axis=0)).max() if n > 1 else 1.0
         reach = np.full(n, reach if reach > 0 else 1.0, np.float32)
         return reach, reach
     device.check_memory(points=12 * n, normals=12 * n)
@@ -111,7 +111,7 @@ def sampled_mesh(mesh: Mesh, spacing) -> Mesh:
         return mesh
     corners = mesh.vertices[faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(cross, axis=1)
+    doubled = lengths_of(cross)
     longest = np.sqrt(longest2(mesh.vertices.astype(np.float64), faces))
     if spacing is None:
         spacing = min(float(np.median(longest)), float(np.sqrt(doubled.sum() / 2 / FEWEST)))
@@ -177,7 +177,7 @@ def thinned(positions: NDArray, normals: NDArray, colors: NDArray | None, spacin
     count = np.bincount(group)
     mean = lambda values: np.stack([np.bincount(group, column) / count for column in values.T], axis=1)  # noqa: E731
     kept = mean(normals)
-    length = np.linalg.norm(kept, axis=1)
+    length = lengths_of(kept)
     good = length > 1e-3
     return (mean(positions)[good].astype(np.float32), (kept[good] / length[good, None]).astype(np.float32),
             None if colors is None else mean(colors)[good].astype(np.float32))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import lengths_of
 from ..surface.slim import frame_of_normals
 
 FEW = 16  # elements of a cluster that is not divided any more
@@ -132,7 +133,7 @@ def principal(columns: NDArray, piece: NDArray, first: NDArray, count: NDArray) 
         power /= np.maximum(np.trace(power, axis1=1, axis2=2), 1e-300)[:, None, None]
     best = np.argmax(np.einsum("nij,nij->nj", power, power), axis=1)
     axis = power[np.arange(len(power)), :, best]
-    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
+    axis /= np.maximum(lengths_of(axis, keepdims=True), 1e-300)
     return mean, axis.T, np.einsum("ni,nij,nj->n", axis, c, axis)
 
 
@@ -178,7 +179,7 @@ def discs_of(tree: Tree, positions: NDArray, normals: NDArray, radii: NDArray, c
             [np.add.reduceat(w * column, first) / total for column in values.T], axis=1)
         own, facing = p[at], q[at]
         middle, normal = mean(own), mean(facing)
-        length = np.linalg.norm(normal, axis=1)
+        length = lengths_of(normal)
         lost = length < 1e-3  # normals that cancel say nothing: the first one does
         normal = np.where(lost[:, None], facing[first], normal / np.maximum(length, 1e-300)[:, None])
         u, v = frame_of_normals(normal)
@@ -205,7 +206,7 @@ def discs_of(tree: Tree, positions: NDArray, normals: NDArray, radii: NDArray, c
         count = tree.child_count[use]
         first = np.cumsum(count) - count
         child = np.repeat(tree.child_start[use] - first, count) + np.arange(count.sum())
-        apart = np.linalg.norm(out.positions[child] - np.repeat(out.positions[use], count, axis=0), axis=1)
+        apart = lengths_of(out.positions[child] - np.repeat(out.positions[use], count, axis=0))
         if len(use):
             out.spheres[use] = np.maximum.reduceat(apart + out.spheres[child], first)
     return out

@@ -10,7 +10,7 @@ import numpy as np
 from ..device import open_device
 from ..errors import Cancelled, DeviceMemoryError, InputError
 from ..io import load
-from ..surface.arrays import finite_rows, whole_faces
+from ..surface.arrays import finite_rows, lengths_of, whole_faces
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.ranges import RangeScan
@@ -158,17 +158,17 @@ def hybrid_parts(mesh: Mesh, spacing, device, report) -> tuple[dict, int]:
     faces = mesh.faces[whole_faces(mesh.faces, finite)]
     corners = mesh.vertices[faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(cross, axis=1)
+    length = lengths_of(cross)
     faces, corners, cross, length = (a[length > 0] for a in (faces, corners, cross, length))
     if not len(faces):
         raise InputError("scan: expected at least one face with an area, got none")
     middle = (corners.min(axis=1) + corners.max(axis=1)) / 2
-    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    reach = lengths_of(corners - middle[:, None]).max(axis=1)
     facing = cross / length[:, None]
     normals = mesh.normals
     if normals is None or not np.isfinite(normals).all():
         normals = face_normals(mesh.vertices, faces)
-    zero = np.linalg.norm(normals, axis=1) == 0
+    zero = lengths_of(normals) == 0
     normals = unit(np.where(zero[:, None], (0, 0, 1), normals))
     report("points", 1.0)
     tree = cluster(middle.astype(np.float32), facing.astype(np.float32), lambda done: report("clusters", done))
@@ -183,7 +183,7 @@ def hybrid_parts(mesh: Mesh, spacing, device, report) -> tuple[dict, int]:
     own = np.where(last, tree.count, 0)
     triangle_offset = np.concatenate([[0], np.cumsum(own)])
     at = np.repeat(tree.start - triangle_offset[:-1], own) + np.arange(triangle_offset[-1])
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    edges = lengths_of(corners - np.roll(corners, 1, axis=1))
     return dict(
         positions=discs.positions, normals=discs.normals, radii=discs.radii, spheres=widened(discs.spheres),
         heights=discs.heights, spreads=discs.spreads, level=tree.level, child_offset=child_offset, children=children,

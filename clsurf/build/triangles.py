@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import DeviceMemoryError, InputError
+from ..surface.arrays import lengths_of
 from .point_tree import BLOCK, build_boxes, column_bounds, morton_order
 
 TRIANGLE = 12  # floats a triangle (triangle_distances.cl)
@@ -132,7 +133,7 @@ def barycentric_foot(points: NDArray, corners: NDArray) -> tuple[NDArray, NDArra
     zero = np.zeros_like(s)
     edges = np.stack([np.stack([1 - s, s, zero], axis=1), np.stack([1 - t, zero, t], axis=1),
                       np.stack([zero, 1 - u, u], axis=1)])
-    away = np.linalg.norm(np.einsum("kni,nij->knj", edges, corners) - points, axis=2)
+    away = lengths_of(np.einsum("kni,nij->knj", edges, corners) - points)
     best = edges[np.argmin(away, axis=0), np.arange(len(points))]
     inside = flat & (v > 0) & (w > 0) & (v + w < 1)
     weights = np.where(inside[:, None], np.stack([1 - v - w, v, w], axis=1), best)

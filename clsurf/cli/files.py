@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from .common import DeviceOption, QuietOption, Steps, checked_out, is_surface
 from .recipe import (
     BitsOption,
@@ -107,7 +108,7 @@ def _about_patches(surface) -> None:
     print(f"nodes    {surface.node_count:,}, of which {opaque:,} opaque ({opaque / max(surface.node_count, 1):.1%}), "
           f"colors {colors}, {8 * surface.displacements.itemsize}-bit displacements")
     if len(surface):
-        steps = np.linalg.norm(np.concatenate([surface.axis_x, surface.axis_y]).astype(np.float64), axis=1)
+        steps = lengths_of(np.concatenate([surface.axis_x, surface.axis_y]).astype(np.float64))
         print(f"spacing  {np.median(steps):.4g} ({steps.min():.4g} to {steps.max():.4g}), displacement step "
               f"{np.median(surface.axis_z_length):.3g}")
     print(f"error    diagonal {surface.diagonal:g}; bound {_bound(surface)}")

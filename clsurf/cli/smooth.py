@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from .common import DeviceOption, QuietOption, Steps, checked_out
 
 
@@ -36,7 +37,7 @@ def smooth(scan: Annotated[Path, typer.Argument(help="A mesh or point cloud: PLY
     with steps.step("smooth"):
         clean = clsurf.smooth(loaded, _parsed(strength), iterations, method, fixed_border, progress=steps.progress,
                               device=device or None)
-    moved = np.linalg.norm(clean.points - loaded.points, axis=1)
+    moved = lengths_of(clean.points - loaded.points)
     low, high = loaded.bounds
     steps.say(f"  moved by {np.sqrt(np.mean(moved**2, dtype=np.float64)):.4g} (root mean square), "
               f"{np.sqrt(np.mean(moved**2, dtype=np.float64)) / max(np.linalg.norm(high - low), 1e-300):.3%} of the "

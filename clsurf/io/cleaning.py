@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 
 log = logging.getLogger("clsurf")
 
@@ -125,7 +125,7 @@ def _merged_normals(normals: NDArray, first: NDArray, target: NDArray) -> NDArra
     if len(first) == len(target):
         return normals
     merged = np.stack([np.bincount(target, normals[:, k], len(first)) for k in range(3)], axis=1)
-    length = np.linalg.norm(merged, axis=1, keepdims=True)
+    length = lengths_of(merged, keepdims=True)
     alone = (np.bincount(target, minlength=len(first)) == 1)[:, None] | (length < 1e-3)
     return np.where(alone, normals[first], merged / np.maximum(length, 1e-3)).astype(np.float32)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsurf.errors import FileFormatError
 from clsurf.surface.cloud import PointCloud
 
+from ..surface.arrays import lengths_of
 from .colors import as_rgba8
 from .rows import digits_of, world_of, write_rows
 
@@ -176,7 +177,7 @@ def _guess(table: NDArray) -> list[str]:
 def _mostly_unit(vectors: NDArray) -> bool:
     sample = vectors[:: max(1, len(vectors) // 1000)]
     with np.errstate(all="ignore"):
-        return bool(np.mean(np.abs(np.linalg.norm(sample, axis=1) - 1) < 0.02) > 0.9)
+        return bool(np.mean(np.abs(lengths_of(sample) - 1) < 0.02) > 0.9)
 
 
 def _plain(word: str) -> str:

@@ -16,6 +16,7 @@ from clsurf.errors import FileFormatError, InputError
 from clsurf.surface.cloud import PointCloud
 from clsurf.surface.mesh import Mesh
 
+from ..surface.arrays import lengths_of
 from .colors import as_rgba8
 from .files import write_array
 from .images import read_image, to_srgb8, write_image
@@ -194,7 +195,7 @@ def _faces(scan) -> NDArray:
 def _write_stl(scan: Mesh, path: Path) -> None:
     corners = (scan.vertices + scan.origin).astype(np.float32)[scan.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    length = lengths_of(normals, keepdims=True)
     rows = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
     rows["normal"] = normals / np.where(length > 0, length, 1)
     rows["corners"] = corners

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from clsurf.errors import FileFormatError, InputError
 from clsurf.surface.slim import COEFFICIENTS, SlimSurface, frame_of_normals
 
+from ..surface.arrays import lengths_of
 from .files import existing_file, replacing, write_array
 
 log = logging.getLogger("clsurf")
@@ -186,7 +187,7 @@ def _height_forms(q: NDArray, radius: NDArray, degree: int) -> tuple[NDArray, ND
     """
     flat = (q[:, :-4] == 0).all(axis=1)
     if flat.any():
-        length = np.linalg.norm(q[:, -4:-1], axis=1, keepdims=True)
+        length = lengths_of(q[:, -4:-1], keepdims=True)
         normals = np.where(length > 0, q[:, -4:-1] / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)
         coefficients = np.zeros((len(q), COEFFICIENTS[degree]))
         coefficients[:, 0] = np.where(length > 0, -q[:, -1:] / np.maximum(length, 1e-300), 0)[:, 0]
@@ -229,10 +230,10 @@ def _axes(q: NDArray, radius: NDArray, degree: int) -> NDArray:
         gradient = _gradient(q, p, degree)
         step = _values(q, p, degree)[..., None] * gradient
         p = p - step / np.maximum(np.einsum("nsi,nsi->ns", gradient, gradient), 1e-300)[..., None]
-        p = np.where(np.linalg.norm(p, axis=2, keepdims=True) <= radius[:, None, None], p, 0)
+        p = np.where(lengths_of(p, keepdims=True) <= radius[:, None, None], p, 0)
     gradient = _gradient(q, p, degree)[:, 0]
     central = _gradient(q, np.zeros((len(q), 1, 3)), degree)[:, 0]
-    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    length = lengths_of(gradient, keepdims=True)
     normals = np.where(length > 0, gradient / np.maximum(length, 1e-300), (0.0, 0.0, 1.0))
     # Central differences of a gradient that is at most quadratic are exact.
     hessians = [_hessian(q, at, degree) for at in (np.zeros(3), *np.eye(3))]
@@ -244,8 +245,8 @@ def _axes(q: NDArray, radius: NDArray, degree: int) -> NDArray:
     flat = size <= _ANNIHILATED**2 * size[:, -1:]
     along = np.einsum("nij,ni->nj", vectors, central) * flat  # the gradient's share in the flat directions
     axis = np.einsum("nij,nj->ni", vectors, along)
-    length = np.linalg.norm(axis, axis=1, keepdims=True)
-    linear = length > 0.05 * np.linalg.norm(central, axis=1, keepdims=True)
+    length = lengths_of(axis, keepdims=True)
+    linear = length > 0.05 * lengths_of(central, keepdims=True)
     return np.where(linear, axis / np.maximum(length, 1e-300), normals)
 
 

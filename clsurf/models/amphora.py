@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 
+from ..surface.arrays import lengths_of
 from .lattice import area_density, points_on
 
 # sRGB
@@ -81,7 +82,7 @@ def demo_scan(n: int = 100_000) -> PointCloud:
 def _curve(profile) -> CubicSpline:
     """Return the smooth curve through `profile`, parameter 0 to 1 by chord length."""
     profile = np.asarray(profile, np.float64)
-    chord = np.append(0, np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1)))
+    chord = np.append(0, np.cumsum(lengths_of(np.diff(profile, axis=0))))
     return CubicSpline(chord / chord[-1], profile, bc_type="natural")
 
 
@@ -143,7 +144,7 @@ def _handle(side: int):
 
     def surface(s, t):
         middle, along = curve(s), slope(s)
-        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        along = along / lengths_of(along, keepdims=True)
         angle = -2 * np.pi * t
         radius = _TUBE * (0.90 + 0.10 * np.cos(3 * angle + 40 * s))
         across = radius * np.cos(angle)

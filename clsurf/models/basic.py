@@ -5,6 +5,7 @@ import numpy as np
 from clsurf.errors import InputError
 from clsurf.surface.cloud import PointCloud
 
+from ..surface.arrays import lengths_of
 from .lattice import GOLDEN, points_on
 
 
@@ -30,7 +31,7 @@ def ellipsoid(n: int = 10_000, axes=(1.0, 0.75, 0.5)) -> PointCloud:
 
     points = points_on(surface, n)[0]
     normals = points / axes**2
-    return _cloud(points, normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    return _cloud(points, normals / lengths_of(normals, keepdims=True))
 
 
 def torus(n: int = 10_000, major: float = 1.0, minor: float = 0.4) -> PointCloud:

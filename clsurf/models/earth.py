@@ -10,6 +10,7 @@ from ..build.quantize import quantized
 from ..errors import FileFormatError, InputError
 from ..io.files import existing_file
 from ..io.images import read_image
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear, to_srgb
 from .continents import continents, tinted
@@ -128,7 +129,7 @@ def _deviation(frames, local, z, heights: SphereMap, nodes: int) -> float:
     flat = middles(local).reshape(-1, 2)
     at = np.einsum("na,pax->pnx", flat, frames[:, :2])
     at = at + middles(z[..., None]).reshape(len(frames), -1, 1) * frames[:, None, 2]
-    distance = np.linalg.norm(at, axis=-1, keepdims=True)
+    distance = lengths_of(at, keepdims=True)
     there = 1 + heights.sample((at / distance).reshape(-1, 3))
     return float(np.abs(distance.reshape(-1) - there[:, 0]).max())
 

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import lengths_of
+
 GOLDEN = (5 ** 0.5 - 1) / 2
 _GRID = 129  # samples a side of the area density
 _STEP = 1e-6  # of the parameter range; central differences in float64 are then good to 1e-9
@@ -39,7 +41,7 @@ def points_on(surface: Callable, count: int,
     s, t = _area_to_parameters(area_density(surface) if density is None else density, a, b)
     points = surface(s, t)
     normals = np.cross(_derivative(surface, s, t, 0), _derivative(surface, s, t, 1))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= lengths_of(normals, keepdims=True)
     return points, normals, s, t
 
 
@@ -48,7 +50,7 @@ def area_density(surface: Callable) -> NDArray:
     middles = (np.arange(_GRID) + 0.5) / _GRID
     s, t = (m.ravel() for m in np.meshgrid(middles, middles, indexing="ij"))
     area = np.cross(_derivative(surface, s, t, 0), _derivative(surface, s, t, 1))
-    return np.linalg.norm(area, axis=1).reshape(_GRID, _GRID)
+    return lengths_of(area).reshape(_GRID, _GRID)
 
 
 def _area_to_parameters(density: NDArray, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:

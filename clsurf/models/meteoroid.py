@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from ..surface.mesh import Mesh
 from .lattice import GOLDEN
 
@@ -97,7 +98,7 @@ def icosphere(parts: int) -> tuple[NDArray, NDArray]:
                  axis=1)])
     weights = np.stack([parts - i - j, i, j], axis=1) / parts
     points = np.einsum("pc,fcd->fpd", weights, corners[first]).reshape(-1, 3)
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points /= lengths_of(points, keepdims=True)
     triangles = (small + len(i) * np.arange(20)[:, None, None]).reshape(-1, 3)
     # Vertices on the edges of the icosahedron are named once.
     _, keep, names = np.unique(np.round(points * 2**20).astype(np.int64), axis=0, return_index=True,

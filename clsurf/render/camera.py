@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 
 SEEN = 0.85  # of the radii of base surfels: kernels/common/surfel.clh, CORE
 
@@ -203,7 +203,7 @@ class Camera:
         right, up = (x.ravel() - p.cx) / p.fx, (p.cy - y.ravel()) / p.fy
         if p.perspective:
             view = np.stack([right, up, -np.ones_like(right)], axis=1)
-            view /= np.linalg.norm(view, axis=1, keepdims=True)
+            view /= lengths_of(view, keepdims=True)
             return np.broadcast_to(self.eye, view.shape).copy(), view @ self.rotation
         offset = np.stack([right, up, np.zeros_like(right)], axis=1)
         return self.eye + offset @ self.rotation, np.broadcast_to(-self.rotation[2], offset.shape).copy()

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..errors import InputError
 from ..io.cameras import CameraFile, CameraRecord, read_cameras, write_cameras
+from ..surface.arrays import lengths_of
 from .camera import Camera, _extent, _fitting_distance, _looking
 
 _FLIP = np.diag([1.0, -1.0, -1.0])  # view space to computer vision's camera axes, and back
@@ -200,7 +201,7 @@ def turntable(thing, count: int = 120, direction=(1, 0.5, 2), fov: float = 40.0,
 def _rings(points, reach, target, axis) -> NDArray:
     """Return radius and height (n, 2) of the rings that hold what turns: the hull's of its profile."""
     along = (points - target) @ axis
-    radius = np.linalg.norm(points - target - along[:, None] * axis, axis=1) + reach
+    radius = lengths_of(points - target - along[:, None] * axis) + reach
     rings = np.concatenate([np.stack([radius, along + side * reach], axis=1) for side in (-1, 1)])
     try:
         mirrored = np.concatenate([rings, rings * (-1, 1)])

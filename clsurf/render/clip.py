@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 
 CLIP = 32  # kernels/common/view.clh
 MOST_CLIP_PLANES = 8
@@ -29,7 +30,7 @@ def checked_clip(clip) -> NDArray:
                          f"got {clip!r}")
     if len(planes) > MOST_CLIP_PLANES:
         raise InputError(f"clip: expected at most {MOST_CLIP_PLANES} planes, got {len(planes)}")
-    lengths = np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    lengths = lengths_of(planes[:, :3], keepdims=True)
     if not ((lengths > 1e-150) & (lengths < 1e150)).all():
         raise InputError(f"clip: expected planes with a normal (a, b, c) that is not 0, got {clip!r}")
     return planes / lengths

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
+from ..surface.arrays import lengths_of
 from ..surface.srgb import to_linear
 from ..trace.hits import trace
 from ..trace.kinds import traceable
@@ -81,7 +82,7 @@ def reflect(device: Device, scene, camera, shading: Shading, backdrop: Backdrop,
     points = device.download(arrays["position"])[use].astype(np.float64) + origin
     normals = device.download(arrays["normal"])[use].astype(np.float64)
     sight = points - camera.eye if camera.height is None else np.broadcast_to(-camera.rotation[2], points.shape)
-    sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+    sight = sight / lengths_of(sight, keepdims=True)
     ray = sight - 2 * (sight * normals).sum(axis=1, keepdims=True) * normals
     step = np.array(grains)[number]
     hits = met(scene, points + LIFT * step[:, None] * normals, ray, near=START * step, device=device)
@@ -128,7 +129,7 @@ def shadow_bits(device: Device, scene, points: NDArray, normals: NDArray, step: 
         near = light.kind in ("point", "spot")
         to = np.broadcast_to(np.asarray(light.vector, np.float64), points.shape)
         to = to - points if near else to
-        away = np.linalg.norm(to, axis=1, keepdims=True)
+        away = lengths_of(to, keepdims=True)
         to = to / np.maximum(away, 1e-300)
         seen = np.flatnonzero((normals * to).sum(axis=1) > 0)
         hidden = met(scene, points[seen] + LIFT * step[seen, None] * normals[seen], to[seen], "any",

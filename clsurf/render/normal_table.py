@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface
 
 SIDE = 256  # entries each way
@@ -85,7 +86,7 @@ def _differences(d, opaque, axis):
 
 def ratio_groups(surface: PatchSurface) -> tuple[NDArray, NDArray]:
     """Return the group (p,) int64 of every patch, and the groups' ratios (g, 2) float64, r_x and r_y."""
-    lengths = [np.linalg.norm(a.astype(np.float64), axis=1) for a in (surface.axis_x, surface.axis_y)]
+    lengths = [lengths_of(a.astype(np.float64)) for a in (surface.axis_x, surface.axis_y)]
     ratios = surface.axis_z_length[:, None] / np.stack(lengths, axis=1)
     steps, group = np.unique(np.rint(np.log2(ratios) * RATIO_STEPS), axis=0, return_inverse=True)
     return group.ravel(), 2.0 ** (steps.reshape(-1, 2) / RATIO_STEPS)

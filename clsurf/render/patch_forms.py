@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface, facet_cones
 from .patch_alpha import extended
 from .patch_mips import with_levels
@@ -69,7 +70,7 @@ def least_spacing_px(upload, view: NDArray) -> float:
 
 
 def _least_spacing(surface: PatchSurface) -> float:
-    return min(float(np.linalg.norm(axis.astype(np.float64), axis=1).min(initial=np.inf))
+    return min(float(lengths_of(axis.astype(np.float64)).min(initial=np.inf))
                for axis in (surface.axis_x, surface.axis_y))
 
 

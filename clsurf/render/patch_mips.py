@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface, by_size, chosen_patches, opaque_nodes
 from ..surface.srgb import LINEAR_OF_BYTE, to_srgb
 
@@ -40,7 +41,7 @@ def opaque_area(surface: PatchSurface) -> NDArray:
     for which, nodes, m, n in by_size(surface):
         grid = opaque[nodes].reshape(-1, n, m)
         out[which] = (grid[:, 1:, 1:] & grid[:, 1:, :-1] & grid[:, :-1, 1:] & grid[:, :-1, :-1]).sum(axis=(1, 2))
-    return out * np.linalg.norm(np.cross(surface.axis_x.astype(np.float64), surface.axis_y), axis=1)
+    return out * lengths_of(np.cross(surface.axis_x.astype(np.float64), surface.axis_y))
 
 
 def mixed(fine: PatchSurface, coarse: PatchSurface, which: NDArray) -> PatchSurface:

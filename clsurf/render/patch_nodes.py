@@ -6,6 +6,7 @@ import numpy as np
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface
 from .normal_table import SIDE, TABLE_BYTES, ratio_groups, table_order
 from .tiles import Scratch
@@ -46,7 +47,7 @@ def table_groups(device: Device, surface: PatchSurface) -> TableGroups:
     if len(ratios) == 1:
         x, y = (np.arange(SIDE) * 0.5 * r for r in ratios[0].astype(np.float32).astype(np.float64))
         normals = np.stack([*np.broadcast_arrays(x[:, None], y[None], 1.0)], axis=-1)
-        normals *= UNIT / np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals *= UNIT / lengths_of(normals, keepdims=True)
         table = device.upload(np.concatenate([np.floor(normals + 0.5), np.ones((SIDE, SIDE, 1))], axis=-1), np.uint16)
     return TableGroups(len(ratios), device.upload(group, np.int32), device.upload(ratios, np.float32),
                        device.upload(np.arange(len(group)), np.int32), device.upload(table_order(group), np.int32),

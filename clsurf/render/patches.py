@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface
 from ..surface.srgb import LINEAR_OF_BYTE, linear_color, to_linear
 from .patch_drawing import PatchDrawing
@@ -96,8 +97,8 @@ def upload_patches(device: Device, surface: PatchSurface) -> PatchUpload:
     shown = frames[:p, 12] <= frames[:p, 13]
     boxes = surface.boxes()[shown].reshape(-1, 3) - surface.origin
     center = (boxes.min(axis=0) + boxes.max(axis=0)) / 2 if len(boxes) else np.zeros(3)
-    reach = float(np.linalg.norm(boxes - center, axis=1).max()) if len(boxes) else 0.0
-    spacing = float(np.median(np.linalg.norm(surface.axis_x, axis=1))) if p else 1.0
+    reach = float(lengths_of(boxes - center).max()) if len(boxes) else 0.0
+    spacing = float(np.median(lengths_of(surface.axis_x))) if p else 1.0
     channels = 0 if surface.colors is None else surface.colors.shape[1]
     heights = device.upload(surface.displacements if nodes else np.zeros(1, np.int8))
     colors = device.upload(surface.colors.reshape(-1) if channels and nodes else np.zeros(4, np.uint8))

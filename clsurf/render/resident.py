@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..io.parts import joined
 from ..io.stored import StoredSurface
+from ..surface.arrays import lengths_of
 from ..surface.placed import Placed
 from ..surface.slim import COEFFICIENTS, SlimSurface, segment_end
 from .scene import Scene
@@ -88,7 +89,7 @@ def _distances(bounds: NDArray, matrix: NDArray, camera, size) -> tuple[NDArray,
         else:
             outside |= (side + middle < 0).all(axis=1) | (side + middle - extent > 0).all(axis=1)
     low, high = corners.min(axis=1), corners.max(axis=1)
-    away = np.linalg.norm(np.maximum(np.maximum(low - camera.eye, camera.eye - high), 0), axis=1)
+    away = lengths_of(np.maximum(np.maximum(low - camera.eye, camera.eye - high), 0))
     return np.where(finite, away, np.inf), finite & ~outside
 
 

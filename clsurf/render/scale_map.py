@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import DeviceMemoryError, InputError
+from ..surface.arrays import lengths_of
 from ..surface.cube import border_directions, bordered
 from ..surface.geosphere import geosphere_directions
 from ..surface.scale_map import ScaleMap
@@ -126,7 +127,7 @@ def scale_normals(device: Device, upload: ScaleMapUpload, layer: int, drawing: S
 def bordered_normals(device: Device, upload: ScaleMapUpload, layer: int, drawing: ScaleMapDrawing) -> NDArray:
     """Return the normals of `scale_normals` with the border, (6, size + 2, size + 2, 4) float32."""
     normals, _ = bordered(scale_normals(device, upload, layer, drawing), upload.surface().valid[layer], upload.size)
-    normals[..., :3] /= np.maximum(np.linalg.norm(normals[..., :3], axis=-1, keepdims=True), 1e-20)
+    normals[..., :3] /= np.maximum(lengths_of(normals[..., :3], keepdims=True), 1e-20)
     normals[..., 3] = upload.rho[layer]
     return normals
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
+from ..surface.arrays import lengths_of
 from .skies import directions_of, look_up
 
 FIRST_LEVEL, LAST_LEVEL = 4, 9  # of the quadtree: 16 x 16 to 512 x 512 cells
@@ -127,4 +128,4 @@ def folded(u: NDArray, v: NDArray) -> NDArray:
     x = np.where(y < 0, (1 - np.abs(v)) * np.where(u < 0, -1, 1), u)
     z = np.where(y < 0, (1 - np.abs(u)) * np.where(v < 0, -1, 1), v)
     d = np.stack([x, y, z], axis=-1)
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+    return d / lengths_of(d, keepdims=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
-from ..surface.arrays import box_of, finite_rows
+from ..surface.arrays import box_of, finite_rows, lengths_of
 from ..surface.slim import SlimSurface
 from ..surface.slim_bounds import height_bounds, scaled_coefficients
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
@@ -120,7 +120,7 @@ def upload_slim(device: Device, surface: SlimSurface) -> SlimUpload:
     use = usable if usable.any() else np.zeros(n, bool)
     points = centers[use].astype(np.float64)
     center = sum(box_of(points)) / 2 if len(points) else np.zeros(3)
-    reach = float((np.linalg.norm(points - center, axis=1) + radius[use]).max()) if len(points) else 0.0
+    reach = float((lengths_of(points - center) + radius[use]).max()) if len(points) else 0.0
     drawn = own_radius[usable & leaf] if np.any(usable & leaf) else own_radius[usable]
     return SlimUpload(
         surface.degree, surface.oriented, n, stride, device.upload(planes),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..device import Device, DeviceArray
 from ..errors import InputError
-from ..surface.arrays import box_of, finite_rows, whole_faces
+from ..surface.arrays import box_of, finite_rows, lengths_of, whole_faces
 from ..surface.srgb import LINEAR_OF_BYTE, to_linear
 from ..surface.surfel import SurfelHierarchy
 from .shade import Look, Shading
@@ -83,7 +83,7 @@ def upload_surfels(device: Device, surface: SurfelHierarchy) -> SurfelUpload:
     whole[:, 15] = np.diff(surface.child_offset)
     points = surface.positions[usable].astype(np.float64)
     center = sum(box_of(points)) / 2 if len(points) else np.zeros(3)
-    reach = float((np.linalg.norm(points - center, axis=1) + surface.radii[usable]).max()) if len(points) else 0.0
+    reach = float((lengths_of(points - center) + surface.radii[usable]).max()) if len(points) else 0.0
     colors = None
     if surface.colors is not None:
         colors = np.ones((n, 4), np.float32)

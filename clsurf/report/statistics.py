@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ..render.camera import Camera, Projection
 from ..render.normal_table import NormalStatistics, normal_statistics
+from ..surface.arrays import lengths_of
 from ..surface.patch import PatchSurface, facet_cones, opaque_nodes
 from ..surface.placed import Placed
 from .operations import Operations, counted_operations
@@ -185,14 +186,14 @@ def _away(view: _View, corners: NDArray) -> NDArray:
     axes, cosines = facet_cones(view.patches)
     # The cone's axis in view space by way of the patch's own frame, which `frames` has turned and placed.
     own = np.stack([view.patches.axis_x, view.patches.axis_y, view.patches.axis_z], axis=1).astype(np.float64)
-    own /= np.linalg.norm(own, axis=2, keepdims=True)
+    own /= lengths_of(own, keepdims=True)
     turned = view.frames[1:].transpose(1, 0, 2)
-    turned = turned / np.linalg.norm(turned, axis=2, keepdims=True)
+    turned = turned / lengths_of(turned, keepdims=True)
     axes = np.einsum("pk,pkx->px", np.einsum("px,pkx->pk", axes, own), turned)
     sight = corners if view.projection.perspective else np.broadcast_to([0.0, 0.0, -1.0], corners.shape)
     # n . s >= 0 for every normal within the cone; linear in s, so the corners decide for the whole box.
     sine = np.sqrt(np.clip(1 - cosines ** 2, 0, 1))
-    reach = np.einsum("pcx,px->pc", sight, axes) - sine[:, None] * np.linalg.norm(sight, axis=2)
+    reach = np.einsum("pcx,px->pc", sight, axes) - sine[:, None] * lengths_of(sight)
     return (cosines > 0) & (reach >= 0).all(axis=1)
 
 
@@ -205,7 +206,7 @@ def _found_plain(view: _View) -> NDArray:
     longest = []  # projected box edges along each axis
     for bit, parts in zip((1, 2, 4), (*(view.patches.size.T - 1), ranges[:, 1] - ranges[:, 0]), strict=True):
         low = c[(c & bit) == 0]
-        edges = np.linalg.norm(place[:, low | bit] - place[:, low], axis=2).max(axis=1)
+        edges = lengths_of(place[:, low | bit] - place[:, low]).max(axis=1)
         longest.append(edges / np.maximum(parts, 1))
     front = (depth >= view.near).all(axis=1)
     ratio = depth.max(axis=1) / np.where(front, depth.min(axis=1), 1) if view.projection.perspective else 1.0

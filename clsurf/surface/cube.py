@@ -17,6 +17,8 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import lengths_of
+
 # (6, 3, 3): axis, s, t of each face.
 FACES = np.array([[[1, 0, 0], [0, 0, -1], [0, -1, 0]], [[-1, 0, 0], [0, 0, 1], [0, -1, 0]],
                   [[0, 1, 0], [1, 0, 0], [0, 0, 1]], [[0, -1, 0], [1, 0, 0], [0, 0, -1]],
@@ -155,7 +157,7 @@ def interpolated(values: NDArray, valid: NDArray, directions: NDArray) -> tuple[
 def _directions(along: NDArray) -> NDArray:
     d = (FACES[:, None, None, 0] + along[None, None, :, None] * FACES[:, None, None, 1]
          + along[None, :, None, None] * FACES[:, None, None, 2])
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+    return d / lengths_of(d, keepdims=True)
 
 
 def _texel_of(directions: NDArray, size: int) -> NDArray:

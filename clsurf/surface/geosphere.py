@@ -5,6 +5,8 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import lengths_of
+
 
 @functools.lru_cache(maxsize=4)
 def geosphere_directions(steps: int) -> NDArray:
@@ -29,6 +31,6 @@ def geosphere_directions(steps: int) -> NDArray:
     i, j = i[..., None] / steps, j[..., None] / steps
     out = np.stack([np.where(first, a * (1 - i - j) + b * j + c * i, d * (i + j - 1) + b * (1 - i) + c * (1 - j))
                     for a, b, c, d in grids])
-    out /= np.linalg.norm(out, axis=-1, keepdims=True)
+    out /= lengths_of(out, keepdims=True)
     out.flags.writeable = False
     return out

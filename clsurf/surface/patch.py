@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import finite_rows, frozen
+from .arrays import finite_rows, frozen, lengths_of
 from .placed import Placed, placed
 
 FRAME_BYTES = 40  # 10 floats: origin, a_x, a_y, |a_z| (paper, section 4.3)
@@ -109,7 +109,7 @@ class PatchSurface:
 
     def _check_frames(self):
         x, y = self.axis_x.astype(np.float64), self.axis_y.astype(np.float64)
-        lengths = np.linalg.norm(x, axis=1) * np.linalg.norm(y, axis=1)
+        lengths = lengths_of(x) * lengths_of(y)
         across = np.abs(np.einsum("ij,ij->i", x, y))
         wrong = ~(finite_rows(self.origins) & (lengths > 0) & (across <= 1e-4 * lengths)
                   & (self.axis_z_length > 0) & np.isfinite(lengths) & np.isfinite(self.axis_z_length))
@@ -142,7 +142,7 @@ class PatchSurface:
     def axis_z(self) -> NDArray:
         """(p, 3) float32: the displacement step as a vector, world units."""
         z = np.cross(self.axis_x.astype(np.float64), self.axis_y)
-        z *= (self.axis_z_length / np.linalg.norm(z, axis=1))[:, None]
+        z *= (self.axis_z_length / lengths_of(z))[:, None]
         return z.astype(np.float32)
 
     @property
@@ -285,7 +285,7 @@ def facet_cones(surface: PatchSurface) -> tuple[NDArray, NDArray]:
     corners = np.stack([first, first + 1, first + step, first + step + 1])  # by bits: x, y
     whole = opaque[corners].all(axis=0)
     corners, k = corners[:, whole], patch[first[whole]]
-    lx, ly = np.linalg.norm(surface.axis_x, axis=1), np.linalg.norm(surface.axis_y, axis=1)
+    lx, ly = lengths_of(surface.axis_x), lengths_of(surface.axis_y)
     zx, zy = (surface.axis_z_length / lx)[k], (surface.axis_z_length / ly)[k]
     total = np.zeros((len(surface), 3))
     normals = []
@@ -293,16 +293,16 @@ def facet_cones(surface: PatchSurface) -> tuple[NDArray, NDArray]:
         dx = (d[corners[c | 1]] - d[corners[c & 2]]) * zx
         dy = (d[corners[c | 2]] - d[corners[c & 1]]) * zy
         normal = np.stack([-dx, -dy, np.ones_like(dx)], axis=1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal /= lengths_of(normal, keepdims=True)
         normals.append(normal)
         for axis in range(3):
             total[:, axis] += np.bincount(k, normal[:, axis], len(surface))
-    length = np.linalg.norm(total, axis=1)
+    length = lengths_of(total)
     total /= np.maximum(length, 1e-300)[:, None]
     cosines = np.where(length > 0, 1.0, -1.0)
     for normal in normals:
         np.minimum.at(cosines, k, np.einsum("ij,ij->i", normal, total[k]))
     z = surface.axis_z.astype(np.float64)
     frames = np.stack([surface.axis_x / lx[:, None], surface.axis_y / ly[:, None],
-                       z / np.linalg.norm(z, axis=1, keepdims=True)], axis=1)
+                       z / lengths_of(z, keepdims=True)], axis=1)
     return np.einsum("pa,pax->px", total, frames), cosines

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import box_of, frozen
+from .arrays import box_of, frozen, lengths_of
 from .cube import texel_directions
 from .placed import Placed, placed
 
@@ -136,7 +136,7 @@ class ScaleMap:
         if self.normals is None:
             return None
         n = self.normals * np.float32(1 / NORMAL_HALF) - np.float32(1)
-        return n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), np.float32(1e-6))
+        return n / np.maximum(lengths_of(n, keepdims=True), np.float32(1e-6))
 
     @property
     def bounds(self) -> NDArray:

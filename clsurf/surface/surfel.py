@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import bounds_of, box_of, frozen
+from .arrays import bounds_of, box_of, frozen, lengths_of
 from .cloud import PointCloud
 from .mesh import Mesh
 from .placed import Placed, placed
@@ -236,4 +236,4 @@ def encoded_normals(normals) -> NDArray:
 def decoded_normals(codes) -> NDArray:
     """Return unit normals (..., 3) float64 from the first three bytes of texels."""
     n = np.asarray(codes, np.float64)[..., :3] / 127.5 - 1
-    return n / np.linalg.norm(n, axis=-1, keepdims=True)
+    return n / lengths_of(n, keepdims=True)

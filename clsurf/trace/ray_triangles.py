@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..device import Device
 from ..errors import InputError
-from ..surface.arrays import box_of, finite_rows, whole_faces
+from ..surface.arrays import box_of, finite_rows, lengths_of, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
@@ -27,7 +27,7 @@ def plan_mesh(mesh: Mesh) -> Plan:
     plan = plan_triangles(mesh, None)
     some = mesh.faces[::max(len(mesh.faces) // 10000, 1)]
     with np.errstate(invalid="ignore"):
-        edges = np.linalg.norm(mesh.vertices[some[:, 0]].astype(np.float64) - mesh.vertices[some[:, 1]], axis=1)
+        edges = lengths_of(mesh.vertices[some[:, 0]].astype(np.float64) - mesh.vertices[some[:, 1]])
     edge = float(np.nanmedian(edges)) if np.isfinite(edges).any() else np.inf
     grain = min(edge / 3, plan.grain)  # faces of boxes are large, and near to each other
     return replace(plan, grain=grain, colors=mesh_colors(mesh.faces, mesh.colors))
@@ -47,7 +47,7 @@ def plan_patches(surface: PatchSurface) -> Plan:
     corners = np.stack([first, first + 1, first + m[first], first + m[first] + 1])
     whole = surface.opaque[corners].all(axis=0)
     plan = plan_triangles(patch_mesh(surface), np.tile(patch[first[whole]], 2))
-    spacing = np.linalg.norm(surface.axis_x, axis=1)
+    spacing = lengths_of(surface.axis_x)
     return replace(plan, grain=float(np.median(spacing)) if len(spacing) else 0.0,
                    colors=patch_colors(surface.colors, surface.color, surface.node_offset))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from .kinds import Traced
 
 RAY_FLOATS = HIT_FLOATS = 8  # kernels/trace/ray_walk.clh
@@ -67,7 +67,7 @@ def finish_rays_host(origins: NDArray, directions: NDArray, place: NDArray, star
     distance = (starts + hits[:, 0].astype(np.float64)) * scale
     d = unit_vectors(directions)
     normal = hits[:, 1:4].astype(np.float64) @ linear[:, :3]
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    length = lengths_of(normal, keepdims=True)
     with np.errstate(all="ignore"):
         normal = np.where(length > 0, normal / length, -d)
         normal = np.where((normal * d).sum(axis=1, keepdims=True) > 0, -normal, normal)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..device import Device, DeviceArray
 from ..errors import InputError
 from ..io.stored_leaves import only
-from ..surface.arrays import box_of, finite_rows
+from ..surface.arrays import box_of, finite_rows, lengths_of
 from ..surface.slim import SlimSurface
 from ..surface.slim_bounds import height_bounds, scaled_coefficients
 from ..surface.srgb import LINEAR_OF_BYTE
@@ -116,7 +116,7 @@ def upload_traced(device: Device, surface: SlimSurface) -> TracedSlim:
         degree, surface.oriented, tree, device.upload(boxes), device.upload(balls),
         device.upload(planes.reshape(-1, WIDTH, SURFEL_FLOATS).transpose(0, 2, 1).astype(np.float32)),
         device.upload(tails), None if colors is None else device.upload(colors), surface.origin, center,
-        float((np.linalg.norm(points - center, axis=1) + radii[at]).max()) if len(points) else 0.0)
+        float((lengths_of(points - center) + radii[at]).max()) if len(points) else 0.0)
 
 
 def leaves_of(surface: SlimSurface) -> SlimSurface:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..io.stored import StoredSurface
 from ..io.stored_leaves import StoredLeaves
-from ..surface.arrays import finite_rows
+from ..surface.arrays import finite_rows, lengths_of
 from ..surface.placed import Placed
 from .rays import Hits
 
@@ -104,7 +104,7 @@ def _way(rays, matrix: NDArray | None) -> Way:
         scale = float(np.cbrt(np.linalg.det(linear)))
         origins, directions = (origins - matrix[:3, 3]) @ linear / scale**2, directions @ linear
     with np.errstate(all="ignore"):
-        directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = directions / lengths_of(directions, keepdims=True)
     return Way(origins, directions, rows("near"), rows("far"), scale, matrix)
 
 
