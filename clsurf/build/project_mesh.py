@@ -6,7 +6,6 @@ TVCG 11(3), 2005: right at edges and vertices too, where the nearest face alone 
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.triangles import angles
 
 from ..device import Device
 from ..io.cleaning import first_of_duplicates
@@ -55,6 +54,7 @@ def _pseudonormals(vertices, faces, face, weights) -> NDArray:
         mine = np.stack([key(welded[face[edge]], k) for k in range(3)])[opposite, np.arange(len(edge))]
         normal[edge] = sums[np.searchsorted(keys, mine)]
     if len(vertex):
+        from trimesh.triangles import angles  # a fifth of a second of every start
         by_angle = np.nan_to_num(angles(corners)[:, :, None] * own[near][:, None]).reshape(-1, 3)
         sums = _sums(by_angle, welded[near].ravel(), len(vertices))
         corner = weights[vertex].argmax(axis=1)

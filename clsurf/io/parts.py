@@ -11,12 +11,11 @@ import shutil
 import uuid
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from zarr.storage import LocalStore
 
 from clsurf.errors import FileFormatError
 from clsurf.surface.patch import PatchSurface
@@ -24,6 +23,9 @@ from clsurf.surface.slim import SlimSurface
 
 from .layout import from_arrays, to_arrays
 from .store_arrays import VERSION, create_array, read_arrays
+
+if TYPE_CHECKING:
+    import zarr  # as in store_arrays
 
 KINDS = {"slim_parts": "slim", "patches_parts": "patches"}  # and the kind of their parts
 SHARED = ("degree", "error", "diagonal", "bound", "bound_share", "bound_all", "oriented")
@@ -37,8 +39,7 @@ def write_part(folder: Path, number: int, surface: SlimSurface) -> None:
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}")
     kind, arrays, values = to_arrays(surface)
     try:
-        group = zarr.create_group(LocalStore(temporary), attributes={
-            "format": "clsurf", "version": VERSION, "kind": kind, "values": values})
+        group = _new_group(temporary, {"format": "clsurf", "version": VERSION, "kind": kind, "values": values})
         for name, array in arrays.items():
             create_array(group, name, array, CHUNK_BYTES, "lz4")
         if target.exists():
@@ -46,6 +47,12 @@ def write_part(folder: Path, number: int, surface: SlimSurface) -> None:
         os.replace(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _new_group(folder: Path, attributes: dict) -> "zarr.Group":
+    import zarr
+    from zarr.storage import LocalStore
+    return zarr.create_group(LocalStore(folder), attributes=attributes)
 
 
 def part_folder(folder: Path, number: int) -> Path:
@@ -59,9 +66,8 @@ def write_index(folder: Path, values: dict, bounds: NDArray, surfels: NDArray, k
         shutil.rmtree(left, ignore_errors=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        zarr.create_group(LocalStore(folder / "parts"), attributes={})
-        group = zarr.create_group(LocalStore(folder), attributes={
-            "format": "clsurf", "version": VERSION, "kind": f"{kind}_parts", "values": values})
+        _new_group(folder / "parts", {})
+        group = _new_group(folder, {"format": "clsurf", "version": VERSION, "kind": f"{kind}_parts", "values": values})
         create_array(group, "bounds", np.asarray(bounds, np.float64), CHUNK_BYTES, "lz4")
         create_array(group, "surfels", np.asarray(surfels, np.int64), CHUNK_BYTES, "lz4")
 
@@ -138,7 +144,7 @@ def joined_patches(parts: list[PatchSurface], shared: dict) -> PatchSurface:
                         oriented=all(part.oriented for part in whole))
 
 
-def read_parts(path: Path, group: zarr.Group, members) -> SlimSurface | PatchSurface:
+def read_parts(path: Path, group: "zarr.Group", members) -> SlimSurface | PatchSurface:
     """Return the surface of a store in parts, whole."""
     values, kind = dict(group.attrs["values"]), KINDS[group.attrs["kind"]]
     parts = []

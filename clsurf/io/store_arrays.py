@@ -3,14 +3,16 @@
 import math
 import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import zarr
-from zarr.codecs import BloscCodec, BytesCodec
 
 from clsurf.errors import FileFormatError, InputError
 
 from .files import one_line
+
+if TYPE_CHECKING:
+    import zarr  # functions that need it import it: a fifth of a second of every start
 
 VERSION = 1
 _CHUNK_BYTES = 1 << 21  # of one chunk: parts can be read remotely, yet a surface has few files
@@ -19,8 +21,9 @@ _MOST_COMPRESSED = 20_000  # array bytes per stored byte: zstd on a constant chu
 _BLOSC_HEADER = 16
 
 
-def create_array(group: zarr.Group, name: str, array, chunk_bytes: int = _CHUNK_BYTES, codec: str = "zstd") -> None:
+def create_array(group: "zarr.Group", name: str, array, chunk_bytes: int = _CHUNK_BYTES, codec: str = "zstd") -> None:
     """Write `array` into a group as its member `name`, in chunks of rows."""
+    from zarr.codecs import BloscCodec, BytesCodec
     array = np.ascontiguousarray(array)
     row_bytes = max(1, array.dtype.itemsize * math.prod(array.shape[1:]))
     rows = min(max(1, chunk_bytes // row_bytes), max(1, array.shape[0] if array.ndim else 1))
@@ -30,8 +33,9 @@ def create_array(group: zarr.Group, name: str, array, chunk_bytes: int = _CHUNK_
                        serializer=BytesCodec(endian="little"), filters=None, config={"write_empty_chunks": True})
 
 
-def read_arrays(path: Path, group: zarr.Group, members: "Members", prefix: str = "") -> dict:
+def read_arrays(path: Path, group: "zarr.Group", members: "Members", prefix: str = "") -> dict:
     """Return all arrays of `group`, whose members' names start with `prefix`, after checking what they declare."""
+    import zarr
     # One by one: zarr's concurrent listing of members writes the traceback of a damaged one to the terminal.
     keys = [key.removeprefix(prefix) for key in sorted(members.sizes) if key.startswith(prefix)]
     names = [key.removesuffix("/zarr.json") for key in keys if key.endswith("/zarr.json")]
@@ -41,8 +45,9 @@ def read_arrays(path: Path, group: zarr.Group, members: "Members", prefix: str =
     return {name: np.asarray(array[...]) for name, array in found.items()}
 
 
-def check_plain(path, name: str, array: zarr.Array) -> int:
+def check_plain(path, name: str, array: "zarr.Array") -> int:
     """Refuse an array of another type or encoding than is written, or with absurd chunks; return a chunk's bytes."""
+    from zarr.codecs import BloscCodec, BytesCodec
     codecs = array.metadata.codecs
     plain = array.dtype.kind in "biuf" and all(isinstance(codec, BytesCodec | BloscCodec) for codec in codecs)
     if not plain or len(codecs) != 2:
@@ -53,7 +58,7 @@ def check_plain(path, name: str, array: zarr.Array) -> int:
     return chunk_bytes
 
 
-def check_array(path: Path, name: str, array: zarr.Array, members: "Members") -> None:
+def check_array(path: Path, name: str, array: "zarr.Array", members: "Members") -> None:
     """Refuse an array whose chunks are missing or cannot hold what it declares, before memory is taken."""
     chunk_bytes = check_plain(path, name, array)
     count = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True))

@@ -4,11 +4,10 @@ import json
 import warnings
 import weakref
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
-from zarr.storage import LocalStore, ZipStore
 
 from clsurf.errors import Error, FileFormatError, InputError
 from clsurf.sizes import checked_budget
@@ -20,6 +19,9 @@ from .files import one_line
 from .layout import from_arrays
 from .store_arrays import FolderMembers, Members
 from .stored_leaves import StoredLeaves
+
+if TYPE_CHECKING:
+    import zarr  # as in store_arrays
 
 # A store on the web cannot be listed.
 NAMES = ("centers", "radii", "normals", "normal_codes", "coefficients", "level", "leaf", "child_offset", "children",
@@ -60,6 +62,7 @@ class StoredSurface:
 
     def __init__(self, place, budget: int | str = BUDGET):
         self.place, self.budget = str(place), checked_budget(budget)
+        import zarr
         self._leaves: StoredLeaves | None = None
         try:
             with warnings.catch_warnings():
@@ -143,7 +146,7 @@ class StoredSurface:
         arrays["children"] = children[keep]
         return from_arrays("slim", arrays, values)
 
-    def _part_arrays(self, part: int, names: list[str]) -> dict[str, zarr.Array]:
+    def _part_arrays(self, part: int, names: list[str]) -> dict[str, "zarr.Array"]:
         """Return the arrays of a part, refused before they are read where they do not fit its surfels."""
         prefix = "" if self._single else f"parts/{part:05d}/"
         count = int(self._group["radii"].shape[0] if self._single else self.surfels[part].sum())
@@ -167,10 +170,10 @@ class StoredSurface:
         path = Path(self.place).expanduser()
         return FolderMembers(path, inside) if path.is_dir() else store_arrays.zip_members(path)
 
-    def _checked(self, name: str, shape: tuple, members: Members | None = None) -> zarr.Array:
+    def _checked(self, name: str, shape: tuple, members: Members | None = None) -> "zarr.Array":
         """Return an array of the store, refused where it has another shape (-1: any) or cannot have it."""
         array = self._group[name]
-        if not isinstance(array, zarr.Array) or array.ndim != len(shape) or any(
+        if not hasattr(array, "ndim") or array.ndim != len(shape) or any(
                 want not in (-1, got) for got, want in zip(array.shape, shape, strict=True)):
             raise FileFormatError(f"{self.place}: {name}: expected the shape {shape}, got "
                                   f"{getattr(array, 'shape', 'a group')}: damaged")
@@ -220,6 +223,7 @@ def _store(place: str):
             return FsspecStore.from_url(place, read_only=True)
         except ImportError as error:
             raise InputError(f"{place}: needs fsspec: pip install clsurf[scale] ({one_line(error)})") from None
+    from zarr.storage import LocalStore, ZipStore
     path = Path(place).expanduser()
     if not path.exists():
         raise InputError(f"{place}: no such .clsurf store")

@@ -6,7 +6,6 @@ the body in a crease, and a dark inside. All of it comes from formulas; nothing 
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from clsurf.errors import InputError
@@ -79,8 +78,9 @@ def demo_scan(n: int = 100_000) -> PointCloud:
     return PointCloud(points @ turn, normals @ turn, rgba, origin=np.zeros(3))
 
 
-def _curve(profile) -> CubicSpline:
-    """Return the smooth curve through `profile`, parameter 0 to 1 by chord length."""
+def _curve(profile):
+    """Return the smooth curve through `profile`, a CubicSpline, parameter 0 to 1 by chord length."""
+    from scipy.interpolate import CubicSpline  # a third of a second of every start
     profile = np.asarray(profile, np.float64)
     chord = np.append(0, np.cumsum(lengths_of(np.diff(profile, axis=0))))
     return CubicSpline(chord / chord[-1], profile, bc_type="natural")

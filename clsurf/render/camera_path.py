@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..errors import InputError
 from ..io.cameras import CameraFile, CameraRecord, read_cameras, write_cameras
@@ -112,6 +110,8 @@ def _wrapped(times: NDArray, closed: bool):
 
 
 def _splines(cameras, keys, times, _):
+    from scipy.interpolate import CubicSpline, PchipInterpolator  # a third of a second of every start
+    from scipy.spatial.transform import Rotation, RotationSpline
     if len(cameras) == 1:
         return None
     eyes = np.array([cameras[k].eye for k in keys])
