@@ -64,7 +64,7 @@ def convert(mesh: Mesh, request, device, progress) -> PatchSurface:
         mesh = _with_faces(mesh, mesh.faces[usable], np.flatnonzero(usable))
         finite = finite_rows(mesh.vertices)  # the others have no face any more
         mesh = replace(mesh, vertices=np.where(finite[:, None], mesh.vertices, mesh.vertices[mesh.faces[0, 0]]))
-    used = mesh.vertices[mesh.faces.ravel()]
+    used = mesh.vertices.take(mesh.faces.ravel(), 0)
     diagonal = float(np.linalg.norm(extent_of(used).astype(np.float64)))
     if not diagonal > 0:
         raise InputError("scan: expected a mesh with some extent, got all corners at one place")
@@ -93,7 +93,7 @@ def converted(mesh: Mesh, request, device, progress) -> Conversion:
     spans = _spans(request.nodes)
     area = _doubled_areas(mesh).sum() / 2
     count = request.patches or max(1, round(max(len(mesh.vertices) * NODES_A_VERTEX, DEFAULT_NODES) / (m * n)))
-    extent = extent_of(mesh.vertices[mesh.faces.ravel()]).max()  # of a needle: its area says little
+    extent = extent_of(mesh.vertices.take(mesh.faces.ravel(), 0)).max()  # of a needle: its area says little
     width = request.spacing * spans.min() if request.spacing else max(math.sqrt(area / count), extent / (8 * count))
     if request.spacing:
         count = max(1, int(area / width ** 2))
@@ -140,7 +140,7 @@ def _check_count(graph: FaceGraph, patches: int) -> None:
 def _prepared(mesh: Mesh, longest: float) -> tuple[Mesh, NDArray, NDArray]:
     """Return the mesh with long edges cut, its faces over welded vertices, and these in float64."""
     v = mesh.vertices.astype(np.float64)
-    edge = v[mesh.faces] - v[mesh.faces[:, [1, 2, 0]]]
+    edge = v.take(mesh.faces, 0) - v.take(mesh.faces[:, [1, 2, 0]], 0)
     if np.einsum("fij,fij->fi", edge, edge).max() > longest ** 2:
         faces, ends, source = split_faces(mesh.faces, v, longest)
         mesh = _with_faces(_with_midpoints(mesh, ends), faces, source)
@@ -169,7 +169,7 @@ def _with_midpoints(mesh: Mesh, ends: list[NDArray]) -> Mesh:
 
 
 def _doubled_areas(mesh: Mesh) -> NDArray:
-    v = mesh.vertices.astype(np.float64)[mesh.faces]
+    v = mesh.vertices.astype(np.float64).take(mesh.faces, 0)
     return lengths_of(np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]))
 
 

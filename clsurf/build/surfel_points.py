@@ -109,7 +109,7 @@ def sampled_mesh(mesh: Mesh, spacing) -> Mesh:
     faces = mesh.faces[whole_faces(mesh.faces, finite)]
     if not len(faces):
         return mesh
-    corners = mesh.vertices[faces].astype(np.float64)
+    corners = mesh.vertices.take(faces, 0).astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = lengths_of(cross)
     longest = np.sqrt(longest2(mesh.vertices.astype(np.float64), faces))

@@ -156,7 +156,7 @@ def hybrid_parts(mesh: Mesh, spacing, device, report) -> tuple[dict, int]:
     """Return the fields of the hybrid form but for its maps, and the number of surfels."""
     finite = finite_rows(mesh.vertices)
     faces = mesh.faces[whole_faces(mesh.faces, finite)]
-    corners = mesh.vertices[faces].astype(np.float64)
+    corners = mesh.vertices.take(faces, 0).astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = lengths_of(cross)
     faces, corners, cross, length = (a[length > 0] for a in (faces, corners, cross, length))

@@ -35,7 +35,7 @@ def nearest_triangles(vertices: NDArray, faces: NDArray, points: NDArray, device
     InputError
         No face with finite corners.
     """
-    corners = np.asarray(vertices, np.float64)[faces]
+    corners = np.asarray(vertices, np.float64).take(faces, 0)
     kept = np.flatnonzero(np.isfinite(corners).all(axis=(1, 2)))
     corners = corners[kept]
     if not len(corners):

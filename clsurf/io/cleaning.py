@@ -66,9 +66,9 @@ def _clean_cloud(scan: PointCloud, dropped: dict[str, int]) -> PointCloud:
     if normals is not None:
         normals = _merged_normals(normals[rows], first, target)
     rows = rows[first]
-    take = lambda array: None if array is None else array[rows]  # noqa: E731
-    return PointCloud(scan.points[rows], normals, take(scan.colors), take(scan.scanners), scan.origin,
-                      {key: np.asarray(value)[rows] for key, value in scan.attributes.items()})
+    take = lambda array: None if array is None else array.take(rows, 0)  # noqa: E731
+    return PointCloud(take(scan.points), normals, take(scan.colors), take(scan.scanners), scan.origin,
+                      {key: np.asarray(value).take(rows, 0) for key, value in scan.attributes.items()})
 
 
 def _clean_mesh(scan: Mesh, dropped: dict[str, int]) -> Mesh:
@@ -102,10 +102,10 @@ def _clean_mesh(scan: Mesh, dropped: dict[str, int]) -> Mesh:
     if normals is not None:
         normals = _merged_normals(normals[rows], first, target)[used]
     rows = rows[first[used]]
-    take = lambda array: None if array is None else array[rows]  # noqa: E731
+    take = lambda array: None if array is None else array.take(rows, 0)  # noqa: E731
     faces = (np.cumsum(used) - 1)[faces]
-    return Mesh(scan.vertices[rows], faces, normals, take(scan.colors), take(scan.uv), scan.texture, scan.origin,
-                {key: np.asarray(value)[rows] for key, value in scan.attributes.items()})
+    return Mesh(take(scan.vertices), faces, normals, take(scan.colors), take(scan.uv), scan.texture, scan.origin,
+                {key: np.asarray(value).take(rows, 0) for key, value in scan.attributes.items()})
 
 
 def _unit_normals(normals: NDArray) -> tuple[NDArray, NDArray, bool]:

@@ -185,12 +185,12 @@ def turntable(thing, count: int = 120, direction=(1, 0.5, 2), fov: float = 40.0,
     side /= np.linalg.norm(side)
     ways = rings[:, 0, None, None] * (np.cos(angle) * side + np.sin(angle) * np.cross(axis, side)) \
         + rings[:, 1, None, None] * axis
-    view = ways.reshape(-1, 3) @ rotation.T
+    view = np.ascontiguousarray((ways.reshape(-1, 3) @ rotation.T).T)
     tan = np.tan(np.radians(fov) / 2) / margin * np.array([aspect, 1.0])
     shift = np.zeros(2)
     for _ in range(4):  # the nearest distance depends on the centring, and the other way round
         distance = _fitting_distance(view, shift, 0.0, tan)
-        slope = (view[:, 1] - shift[1]) / np.maximum(distance - view[:, 2], 1e-9 * max(distance, 1e-300))
+        slope = (view[1] - shift[1]) / np.maximum(distance - view[2], 1e-9 * max(distance, 1e-300))
         shift[1] += distance * (slope.min() + slope.max()) / 2
     distance = _fitting_distance(view, shift, 0.0, tan)
     eye = target + shift[1] * rotation[1] + (distance if distance > 0 else 1.0) * rotation[2]

@@ -39,13 +39,13 @@ def upload_mesh(device: Device, mesh: Mesh) -> MeshUpload:
     finite = finite_rows(mesh.vertices)
     faces = mesh.faces if finite.all() else mesh.faces[whole_faces(mesh.faces, finite)]
     faces, order = drawing_order(mesh.vertices, faces)
-    put = lambda rows: device.upload(_fours(rows[order]))  # noqa: E731
+    put = lambda rows: device.upload(_fours(rows.take(order, 0)))  # noqa: E731
     colors = None if mesh.colors is None else LINEAR_OF_BYTE[mesh.colors[:, :3]]
     textured = mesh.uv is not None and mesh.texture is not None and mesh.texture.size > 0
     triangles = Triangles(put(mesh.vertices), device.upload(faces), None if mesh.normals is None else put(mesh.normals),
                           None if colors is None else put(colors), put(mesh.uv) if textured else None,
                           upload_texture(device, mesh.texture) if textured else None)
-    points = mesh.vertices[order].astype(np.float64)
+    points = mesh.vertices.take(order, 0).astype(np.float64)
     low, high = box_of(points) if len(points) else (np.zeros(3), np.zeros(3))
     center = low / 2 + high / 2
     return MeshUpload(triangles, mesh.origin, center, float(np.linalg.norm(high - center)))

@@ -53,14 +53,12 @@ def mixed(fine: PatchSurface, coarse: PatchSurface, which: NDArray) -> PatchSurf
     rows = {name: getattr(fine, name).copy() for name in ("axis_x", "axis_y", "size")}
     for name, values in rows.items():
         values[which] = getattr(coarse, name)
-    of_fine = np.flatnonzero(np.repeat(~takes, np.diff(fine.node_offset)))
     goes = np.repeat(takes, rows["size"].prod(axis=1))
-    to_fine, to_coarse = np.flatnonzero(~goes), np.flatnonzero(goes)
-
-    def nodes(a, b):
-        out = np.empty((len(goes), *a.shape[1:]), a.dtype)
-        out[to_fine], out[to_coarse] = a[of_fine], b
-        return out
+    # Where each node comes from in all fine ones and the coarse ones behind them. `take` is 3 times as fast as [...].
+    source = np.empty(len(goes), np.int64)
+    source[~goes] = np.flatnonzero(np.repeat(~takes, np.diff(fine.node_offset)))
+    source[goes] = fine.node_count + np.arange(coarse.node_count)
+    nodes = lambda a, b: np.concatenate([a, b]).take(source, 0)  # noqa: E731
     return replace(fine, **rows, displacements=nodes(fine.displacements, coarse.displacements),
                    colors=None if fine.colors is None else nodes(fine.colors, coarse.colors))
 
@@ -74,11 +72,11 @@ def with_levels(surface: PatchSurface, most: int) -> tuple[PatchSurface, int]:
     count = len(levels)
     patch = np.concatenate([np.repeat(np.arange(len(s)), np.diff(s.node_offset)) for s in levels])
     order = np.argsort(patch, kind="stable")
-    colors = None if surface.colors is None else np.concatenate([s.colors for s in levels])[order]
+    colors = None if surface.colors is None else np.concatenate([s.colors for s in levels]).take(order, 0)
     columns = {name: np.stack([getattr(s, name) for s in levels], axis=1).reshape(
         len(surface) * count, *getattr(surface, name).shape[1:])
         for name in ("origins", "axis_x", "axis_y", "axis_z_length", "size")}
-    return replace(surface, **columns, displacements=np.concatenate([s.displacements for s in levels])[order],
+    return replace(surface, **columns, displacements=np.concatenate([s.displacements for s in levels]).take(order),
                    colors=colors), count
 
 

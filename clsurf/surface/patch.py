@@ -244,8 +244,8 @@ def chosen_patches(surface: PatchSurface, which: NDArray) -> PatchSurface:
     counts = np.diff(surface.node_offset)[which]
     nodes = np.repeat(surface.node_offset[which] - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
     rows = {name: getattr(surface, name)[which] for name in ("origins", "axis_x", "axis_y", "axis_z_length", "size")}
-    return replace(surface, **rows, displacements=surface.displacements[nodes],
-                   colors=None if surface.colors is None else surface.colors[nodes])
+    return replace(surface, **rows, displacements=surface.displacements.take(nodes),
+                   colors=None if surface.colors is None else surface.colors.take(nodes, 0))
 
 
 def by_size(surface: PatchSurface) -> Iterator[tuple[NDArray, NDArray | slice, int, int]]:

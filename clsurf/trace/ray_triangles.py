@@ -83,7 +83,7 @@ def plan_triangles(mesh: Mesh, numbers: NDArray | None) -> Plan:
     low, high = box_of(points)
     middle, extent = low / 2 + high / 2, float((high / 2 - low / 2).max()) * 2
     unit = 2.0 ** math.ceil(math.log2(extent)) if extent > 0 else max(float(np.abs(middle).max()), 1.0)
-    corners = ((mesh.vertices.astype(np.float64) - middle) / unit).astype(np.float32)[faces]
+    corners = ((mesh.vertices.astype(np.float64) - middle) / unit).astype(np.float32).take(faces, 0)
     order = (kept if numbers is None else numbers[kept]).astype(np.int32)
     half, center = (high - low) / 2 / unit + 1e-3, mesh.origin + middle
     frame = Traced(center, unit, np.stack([-half, half]), lambda *_: None)
