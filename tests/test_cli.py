@@ -57,6 +57,9 @@ def test_help(command, capsys):
                                                                      "lod"),
     (["render", "gone.ply", "x.png", "--shading", "metal"], "metal"), (["demo", "x.gif"], "ends in .png"),
     (["build", "gone.ply", "x.clsurf", "--error", "2"], "between 0 and 1"), (["convert", "gone.ply", "x"], "ends in"),
+    (["render", "gone.ply", "x.png", "--eye", "1,2,3", "--target", "1,2,3.0"], "apart"),
+    (["smooth", "gone.ply", "-o", "x.ply", "--strength", "-1"], "strength"),
+    (["smooth", "gone.ply", "-o", "x.ply", "--strength", "much"], "strength"),
     (["bench", "nothing"], "nothing"), (["bench", "compare", "one.json"], "two JSON files"),
 ])
 def test_a_users_mistake_is_one_line_and_exit_code_2(arguments, says, capsys, tmp_path, monkeypatch):

@@ -60,7 +60,7 @@ def smooth(scan, strength="auto", iterations=1, method="auto", fixed_border=Fals
     if not isinstance(scan, Mesh | PointCloud):
         raise InputError(f"smooth: expected a Mesh, a PointCloud or the path of one, got {type(scan).__name__}: "
                          "range images have to_points()")
-    strength = _checked_strength(strength)
+    strength = checked_strength(strength)
     if not (isinstance(iterations, int | np.integer) and iterations >= 0):
         raise InputError(f"iterations: expected a whole number of 0 or more, got {iterations!r}")
     if method not in METHODS:
@@ -81,7 +81,8 @@ def smooth(scan, strength="auto", iterations=1, method="auto", fixed_border=Fals
     return scan
 
 
-def _checked_strength(strength) -> float:
+def checked_strength(strength) -> float:
+    """Return the strength as a number, 1 for "auto", or raise InputError."""
     if isinstance(strength, str) and strength == "auto":
         return 1.0
     if not isinstance(strength, int | float | np.number) or not 0 <= strength <= 100:

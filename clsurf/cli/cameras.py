@@ -62,6 +62,8 @@ def checked_view(direction: str, up: str, fov: float | None, eye: str, target: s
     if ortho is not None and not 0 < ortho < float("inf"):
         raise InputError(f"ortho: expected a positive height in world units, got {ortho:g}")
     toward, upward = parsed_vector("direction", direction or "1,0.5,2"), parsed_vector("up", up)
+    if eye and target and parsed_point("eye", eye) == parsed_point("target", target):
+        raise InputError(f"camera: expected --eye and --target apart, got {eye} for both")
     return View(toward, upward, 40.0 if fov is None else fov, parsed_point("eye", eye) if eye else None,
                 parsed_point("target", target) if target else None, ortho)
 

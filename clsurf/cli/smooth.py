@@ -27,7 +27,7 @@ def smooth(scan: Annotated[Path, typer.Argument(help="A mesh or point cloud: PLY
     import clsurf
 
     from ..io.scans import WRITES
-    steps = Steps(quiet)
+    steps, force = Steps(quiet), _parsed(strength)
     checked_out(out, WRITES)
     with steps.step("load"):
         loaded = clsurf.load(scan)
@@ -35,7 +35,7 @@ def smooth(scan: Annotated[Path, typer.Argument(help="A mesh or point cloud: PLY
     if not isinstance(loaded, clsurf.Mesh | clsurf.PointCloud):
         raise InputError(f"{scan}: expected a mesh or a point cloud, got {type(loaded).__name__}")
     with steps.step("smooth"):
-        clean = clsurf.smooth(loaded, _parsed(strength), iterations, method, fixed_border, progress=steps.progress,
+        clean = clsurf.smooth(loaded, force, iterations, method, fixed_border, progress=steps.progress,
                               device=device or None)
     moved = lengths_of(clean.points - loaded.points)
     low, high = loaded.bounds
@@ -48,7 +48,8 @@ def smooth(scan: Annotated[Path, typer.Argument(help="A mesh or point cloud: PLY
 
 
 def _parsed(text: str) -> float | str:
+    from ..analysis.smooth import checked_strength
     try:
-        return text if text == "auto" else float(text)
-    except ValueError:
+        return checked_strength(text if text == "auto" else float(text))
+    except (ValueError, InputError):
         raise InputError(f"strength: expected auto or a number from 0 to 100, got {text!r}") from None
