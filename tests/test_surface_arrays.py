@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsurf.surface.arrays import box_of, extent_of, finite_rows, lengths_of, squared_lengths, whole_faces
+from clsurf.surface.arrays import box_of, extent_of, finite_rows, lengths_of, squared_lengths, used_numbers, whole_faces
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 1000])
@@ -21,6 +21,7 @@ def test_boxes_and_finite_rows_are_those_of_each_column(count, columns):
         assert np.array_equal(finite, np.isfinite(points).all(axis=1)) and finite.all() == (holes == 0)
         faces = np.random.default_rng(2).integers(0, count, (50, 3))
         assert np.array_equal(whole_faces(faces, finite), finite[faces].all(axis=1))
+        assert np.array_equal(used_numbers(faces, count), np.unique(faces))
     if columns < 8:
         for vectors in (points, points.astype(np.float64), np.stack([points, -points])):
             assert np.array_equal(squared_lengths(vectors), (vectors ** 2).sum(axis=-1), equal_nan=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..io.cleaning import first_of_duplicates
-from ..surface.arrays import extent_of, finite_rows, lengths_of, whole_faces
+from ..surface.arrays import extent_of, finite_rows, lengths_of, used_numbers, whole_faces
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from .patch_edges import ALONG
@@ -311,7 +311,7 @@ def _distances(found: Conversion, face: NDArray, points: NDArray) -> tuple[NDArr
 
 def _with_bound(found: Conversion, diagonal: float) -> PatchSurface:
     graph = found.graph
-    chosen = np.unique(graph.corners)[::max(1, len(graph.vertices) // BOUND_SAMPLES)]
+    chosen = used_numbers(graph.corners, len(graph.vertices))[::max(1, len(graph.vertices) // BOUND_SAMPLES)]
     upper, _ = _distances(found, _face_of_vertices(graph)[chosen], graph.vertices[chosen])
     upper = upper[np.isfinite(upper)]  # the others' patches are wholly transparent, as the scan is there
     bound = float(np.quantile(upper, BOUND_SHARE, method="higher")) if len(upper) else float("nan")

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.arrays import finite_rows, lengths_of
+from ..surface.arrays import finite_rows, lengths_of, used_numbers
 from ..surface.mesh import Mesh
 from ..surface.slim import frame_of_normals
 from .neighbours import BoxTree, box_tree, nearest
@@ -24,7 +24,7 @@ def bounds_of(scan, base: Base, device) -> tuple[float, float]:
     """
     points = scan.points
     if isinstance(scan, Mesh) and len(scan.faces):
-        points = points[np.unique(scan.faces)]  # loose vertices are no part of the surface
+        points = points[used_numbers(scan.faces, len(points))]  # loose vertices are no part of the surface
     points = points[finite_rows(points)]
     places = [evenly(points, BOUND_SAMPLES)]
     if isinstance(scan, Mesh) and len(scan.faces):

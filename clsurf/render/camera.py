@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..surface.arrays import finite_rows, lengths_of
+from ..surface.arrays import finite_rows, lengths_of, used_numbers
 
 SEEN = 0.85  # of the radii of base surfels: kernels/common/surfel.clh, CORE
 
@@ -253,7 +253,7 @@ def _extent(thing, box) -> tuple[NDArray, NDArray | float]:
         flat = np.sqrt(np.clip(1 - thing.normals[base].astype(np.float64) ** 2, 0, 1)).max(axis=1)
         return thing.positions[base] + thing.origin, SEEN * thing.radii[base] * flat
     if hasattr(thing, "normal_atlas") and thing.hybrid:
-        return thing.vertices[np.unique(thing.triangles)] + thing.origin, 0.0
+        return thing.vertices[used_numbers(thing.triangles, len(thing.vertices))] + thing.origin, 0.0
     if hasattr(thing, "scales") and thing.valid.any():
         return thing.positions()[thing.valid], 0.0
     if hasattr(thing, "points") and len(thing.points):

@@ -250,7 +250,8 @@ def chosen_patches(surface: PatchSurface, which: NDArray) -> PatchSurface:
 
 def by_size(surface: PatchSurface) -> Iterator[tuple[NDArray, NDArray | slice, int, int]]:
     """Yield (patches, an index of all their nodes, m, n) for every size that patches have."""
-    for m, n in np.unique(surface.size, axis=0).tolist():
+    sizes = surface.size[:1] if surface.equal_sizes else np.unique(surface.size, axis=0)
+    for m, n in sizes.tolist():
         which = np.flatnonzero((surface.size == (m, n)).all(axis=1))
         whole = len(which) == len(surface)
         yield which, slice(None) if whole else (surface.node_offset[which][:, None] + np.arange(m * n)).ravel(), m, n

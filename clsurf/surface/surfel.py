@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import bounds_of, box_of, frozen, lengths_of
+from .arrays import bounds_of, box_of, frozen, lengths_of, used_numbers
 from .cloud import PointCloud
 from .mesh import Mesh
 from .placed import Placed, placed
@@ -167,7 +167,7 @@ class SurfelHierarchy:
     def bounds(self) -> NDArray:
         """Bounding box (2, 3) float64 of the base surfels' discs, or of the mesh; NaN where there is nothing."""
         if self.hybrid:
-            return bounds_of(self.vertices[np.unique(self.triangles)], self.origin)
+            return bounds_of(self.vertices[used_numbers(self.triangles, len(self.vertices))], self.origin)
         base = self.base
         if not len(base):
             return np.full((2, 3), np.nan)
@@ -216,7 +216,7 @@ def _check_tree(offset: NDArray, children: NDArray, level: NDArray) -> None:
     """Refuse children with two parents, apart from each other, or not below their parents; and levels out of order."""
     if np.any(np.diff(level) < 0):
         raise ValueError("level: expected in ascending order, the coarsest first")
-    if len(np.unique(children)) < len(children):
+    if len(used_numbers(children, len(level))) < len(children):
         raise ValueError("children: expected every surfel below one other only")
     step = np.diff(children)
     first = np.zeros(len(children) + 1, bool)
