@@ -1,4 +1,6 @@
-"""What meshes and points of a surface are made by: how fine it is, and where it is drawn."""
+"""What meshes and points of a surface are made by: what they are asked for, how fine it is, where it is drawn."""
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,13 +8,36 @@ from numpy.typing import NDArray
 from ..device import Device
 from ..errors import InputError
 from ..io.stored import StoredSurface
+from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
+from ..surface.patch import PatchSurface
+from ..surface.ranges import RangeScan
+from ..surface.scale_map import ScaleMap
+from ..surface.scale_mesh import scale_mesh
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from ..trace.hits import trace
 
 OF_RADIUS = 0.25  # the default spacing over the median radius of the leaves
 SAMPLED_PARTS = 16  # of a surface in its store, whose radii stand for all
+
+
+def checked_spacing(spacing) -> float | None:
+    """Return a spacing, or None for one that is to be chosen; raises InputError."""
+    if spacing is None:
+        return None
+    if isinstance(spacing, bool) or not isinstance(spacing, int | float | np.number) or not 0 < spacing < math.inf:
+        raise InputError(f"spacing: expected a length in world units above 0, got {spacing!r:.60}")
+    return float(spacing)
+
+
+def check_surface(surface) -> None:
+    """Raise InputError for what is no surface."""
+    if isinstance(surface, PointCloud | RangeScan):
+        raise InputError(f"surface: expected a surface, got a {type(surface).__name__}: make one with build_slim")
+    if not isinstance(surface, SlimSurface | StoredSurface | PatchSurface | SurfelHierarchy | ScaleMap | Mesh):
+        raise InputError("surface: expected a SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap or "
+                         f"Mesh, or one of these placed, got {type(surface).__name__}")
 
 
 def spacing_of(surface) -> float:
@@ -29,8 +54,7 @@ def spacing_of(surface) -> float:
             return float(surface.spacing)
         radii = surface.radii[surface.base] * 2
     else:
-        mesh = getattr(surface, "mesh", surface)
-        return _edge_of(mesh)
+        return _edge_of(scale_mesh(surface) if isinstance(surface, ScaleMap) else getattr(surface, "mesh", surface))
     radii = radii[np.isfinite(radii) & (radii > 0)]
     if not len(radii):
         raise InputError("surface: expected at least one leaf, got none")

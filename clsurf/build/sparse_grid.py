@@ -99,10 +99,7 @@ def reporter(name: str, progress):
 
 
 def projected(surface, points: NDArray, device: Device, report, stage: str):
-    """Yield (rows, projection) of world points (n, 3), chunk by chunk: a few hundred bytes a point are needed at once.
-
-    `points` may be a function that gives the rows of a slice.
-    """
+    """Yield (rows, projection) of world points (n, 3), chunk by chunk: it takes a few hundred bytes a point."""
     count = len(points)
     for start in range(0, count, CHUNK):
         report(stage, start / count)
@@ -133,15 +130,45 @@ def distances(surface, low: NDArray, spacing: float, keys: NDArray, device: Devi
     return out
 
 
-def sparse_grid(surface, spacing: float, device: Device, report, most_cells: float, coarser: bool = False) -> SparseGrid:
-    """Return the grid of edge `spacing` near a surface that `project` takes.
+@dataclass(frozen=True, eq=False)
+class NearCells:
+    """Cells of twice the edge `spacing` near a surface, whose eight parts make up a grid of that edge.
+
+    Attributes
+    ----------
+    low : (3,) float64
+        World position of the corner of cell 0.
+    spacing : float
+        World units.
+    parents : (p,) int64
+        Keys, ascending.
+    """
+
+    low: NDArray
+    spacing: float
+    parents: NDArray
+
+    def cells(self, rows=slice(None)) -> NDArray:
+        """Return the keys (8 p,) int64 of the parts of some parents, ascending."""
+        return ((self.parents[rows] << 3)[:, None] | np.arange(8)).ravel()
+
+    def grid(self) -> SparseGrid:
+        """Return all parts with their corners."""
+        cells = self.cells()
+        return SparseGrid(self.low, self.spacing, cells, _corners(self.parents))
+
+
+def near_cells(surface, spacing: float, device: Device, report, most_cells: float, coarser: bool = False) -> NearCells:
+    """Return the cells near a surface that `project` takes.
 
     Parameters
     ----------
+    spacing : float
+        Edge of the finest cells, world units.
     most_cells : float
-        About as many cells as the finest grid may have.
+        About as many of those as there may be.
     coarser : bool
-        Where it would have more, take a larger spacing instead of refusing.
+        Where there would be more, take a larger spacing instead of refusing.
 
     Raises
     ------
@@ -150,19 +177,19 @@ def sparse_grid(surface, spacing: float, device: Device, report, most_cells: flo
     """
     while True:
         found = _refined(surface, spacing, device, report, most_cells)
-        if isinstance(found, SparseGrid):
+        if isinstance(found, NearCells):
             return found
         if not coarser:
-            raise InputError(f"spacing: expected at least {found:.4g} on this surface, whose mesh has more than "
-                             f"{most_cells / 3:,.0f} vertices otherwise, got {spacing:.4g}")
+            raise InputError(f"spacing: expected at least {found:.4g} on this surface, where a finer grid has more "
+                             f"than {most_cells:,.0f} cells, got {spacing:.4g}")
         spacing = found
 
 
-def _refined(surface, spacing, device, report, most_cells) -> SparseGrid | float:
-    """Return the grid, or the spacing that has few enough cells."""
+def _refined(surface, spacing, device, report, most_cells) -> NearCells | float:
+    """Return the cells, or the spacing at which they are few enough."""
     box = surface.bounds
     if not np.isfinite(box).all():
-        raise InputError("surface: expected at least one leaf, got none")
+        raise InputError("surface: expected at least one leaf, disc or face, got none")
     extent = float(np.ptp(box, axis=0).max())
     margin = 2 * spacing + 0.02 * extent
     low, size = box[0] - margin, np.ptp(box, axis=0) + 2 * margin
@@ -179,15 +206,14 @@ def _refined(surface, spacing, device, report, most_cells) -> SparseGrid | float
         if expected > most_cells:
             # Areas grow by four a level, vegetation and noise by more: the next level looks again.
             return spacing * max(1.05, np.sqrt(expected / most_cells))
+        if level == 1:
+            return NearCells(low, spacing, keys)
         level -= 1
         keys = ((keys << 3)[:, None] | np.arange(8)).ravel()
-        if level == 0:
-            return SparseGrid(low, spacing, keys, _corners(keys))
 
 
-def _corners(cells: NDArray) -> NDArray:
-    """Return the keys of all corners of cells whose eight brothers are cells too, ascending."""
-    parents = cells[::8] >> 3
+def _corners(parents: NDArray) -> NDArray:
+    """Return the keys of all corners of the eight parts of each parent, ascending."""
     steps = np.arange(3)
     inside = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     all_of_them = []

@@ -1,6 +1,5 @@
 """Surfaces as triangle meshes: for programs that know meshes only, and for printing."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,20 +10,18 @@ from scipy.sparse import csgraph
 from ..device import Device, open_device
 from ..errors import InputError
 from ..io.stored import StoredSurface
-from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
 from ..surface.placed import Placed
-from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.scale_mesh import scale_mesh
-from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .marching import marching_cubes
 from .place_colors import colors_at
-from .places import drawn_at, oriented, spacing_of
-from .sparse_grid import SparseGrid, distances, projected, reporter, sparse_grid, stepped
+from .places import check_surface, checked_spacing, drawn_at, oriented, spacing_of
+from .project import project
+from .sparse_grid import SparseGrid, distances, near_cells, projected, reporter, stepped
 
 MOST_CELLS = 3.2e7  # of a spacing that was asked for: 2 GB, and 12 million vertices
 DEFAULT_CELLS = 8e6  # of one that is chosen here
@@ -33,6 +30,8 @@ LONGEST = 1.5  # of the two distances at a crossed edge: 1 where a flat surface 
 SHARE = 0.1  # an edge is crossed this far from its ends at least: no needles, and the projection puts it right
 FARTHEST = 0.9  # a vertex may be moved onto the surface
 BESIDE = 0.1  # a foot may be off the normal through the vertex: more, and the surface ends before it
+BISECTIONS = 4  # of a border's vertices towards the surface: to a sixteenth
+LEAST = 0.15  # of the way out is left: triangles keep some area
 SPECK = 12  # faces of an enclosed hole that is none, and of a fragment that is left out
 
 
@@ -93,24 +92,6 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
     return _marched(surface, spacing, open_device(device), reporter("to_mesh", progress))
 
 
-def checked_spacing(spacing) -> float | None:
-    """Return a spacing, or None for one that is to be chosen; raises InputError."""
-    if spacing is None:
-        return None
-    if isinstance(spacing, bool) or not isinstance(spacing, int | float | np.number) or not 0 < spacing < math.inf:
-        raise InputError(f"spacing: expected a length in world units above 0, got {spacing!r:.60}")
-    return float(spacing)
-
-
-def check_surface(surface) -> None:
-    """Raise InputError for what is no surface."""
-    if isinstance(surface, PointCloud | RangeScan):
-        raise InputError(f"surface: expected a surface, got a {type(surface).__name__}: make one with build_slim")
-    if not isinstance(surface, SlimSurface | StoredSurface | PatchSurface | SurfelHierarchy | ScaleMap | Mesh):
-        raise InputError("surface: expected a SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap or "
-                         f"Mesh, or one of these placed, got {type(surface).__name__}")
-
-
 def placed_mesh(mesh: Mesh, at: Placed) -> Mesh:
     """Return a mesh moved as `at` is."""
     linear = at.matrix[:3, :3]
@@ -133,8 +114,8 @@ class _Vertices:
 def _marched(surface, spacing: float | None, device: Device, report) -> Mesh:
     """Return the mesh of a surface of blended leaves or discs."""
     chosen = spacing is None
-    grid = sparse_grid(surface, spacing_of(surface) if chosen else spacing, device, report,
-                       DEFAULT_CELLS if chosen else MOST_CELLS, coarser=chosen)
+    grid = near_cells(surface, spacing_of(surface) if chosen else spacing, device, report,
+                      DEFAULT_CELLS if chosen else MOST_CELLS, coarser=chosen).grid()
     away = distances(surface, grid.low, grid.spacing, grid.nodes, device, report, "distances")
     report("triangles", 0.0)
     faces, edges = _numbered(marching_cubes(grid, away))
@@ -142,6 +123,7 @@ def _marched(surface, spacing: float | None, device: Device, report) -> Mesh:
     faces = faces[(np.abs(away[ends]).sum(axis=1) <= LONGEST * grid.spacing)[faces].all(axis=1)]
     found = _on_surface(surface, grid, ends, share, device, report)
     faces = _kept(faces, found)
+    _drawn_in(surface, faces, found, grid.spacing, device)
     used, faces = _used(faces, len(edges))
     origin = surface.bounds.mean(axis=0) if isinstance(surface, StoredSurface) else surface.origin
     position, normal = found.position[used], found.normal[used]
@@ -191,6 +173,32 @@ def _kept(faces: NDArray, found: _Vertices) -> NDArray:
     on = found.inside[faces].any(axis=1)
     on |= _enclosed(faces, ~on)
     return _without_specks(faces[on])
+
+
+def _drawn_in(surface, faces: NDArray, found: _Vertices, spacing: float, device: Device) -> None:
+    """Move the vertices beyond the border to where the surface ends, each towards its neighbours on the surface."""
+    out = ~found.inside
+    ends = np.concatenate([faces, np.roll(faces, -1, axis=1)]).ravel(), np.concatenate(
+        [np.roll(faces, -1, axis=1), faces]).ravel()
+    pairs = out[ends[0]] & ~out[ends[1]]
+    rim, at = np.unique(ends[0][pairs], return_inverse=True)
+    if not len(rim):
+        return
+    inner = ends[1][pairs]
+    count = np.bincount(at)[:, None]
+    place, normal = (np.stack([np.bincount(at, array[inner, k]) for k in range(3)], axis=1) / count
+                     for array in (found.position, found.normal))
+    way, turn = found.position[rim] - place, found.normal[rim] - normal
+    low, high = np.full(len(rim), LEAST), np.ones(len(rim))
+    for _ in range(BISECTIONS):
+        share = (low + high) / 2
+        there = normal + share[:, None] * turn
+        there /= np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-300)
+        drawn = drawn_at(surface, place + share[:, None] * way, there, spacing / 2, device)
+        low, high = np.where(drawn, share, low), np.where(drawn, high, share)
+    near = project(surface, place + low[:, None] * way, device)
+    moved = np.linalg.norm(near.position - place, axis=1) <= np.linalg.norm(way, axis=1) * 1.5
+    found.position[rim[moved]], found.normal[rim[moved]] = near.position[moved], near.normal[moved]
 
 
 def _components(faces: NDArray, chosen: NDArray) -> tuple[int, NDArray, NDArray]:
