@@ -120,16 +120,23 @@ def _marched(surface, spacing: float | None, device: Device, report) -> Mesh:
     report("triangles", 0.0)
     faces, edges = _numbered(marching_cubes(grid, away))
     ends, share = _crossings(grid, away, edges)
-    faces = faces[(np.abs(away[ends]).sum(axis=1) <= LONGEST * grid.spacing)[faces].all(axis=1)]
     found = _on_surface(surface, grid, ends, share, device, report)
+    found.near &= np.abs(away[ends]).sum(axis=1) <= LONGEST * grid.spacing
     faces = _kept(faces, found)
     _drawn_in(surface, faces, found, grid.spacing, device)
+    if not len(faces):
+        raise InputError(f"spacing: expected a smaller one for a surface from {_corner(surface, 0)} to "
+                         f"{_corner(surface, 1)}, of which no triangle is left at {grid.spacing:.4g}")
     used, faces = _used(faces, len(edges))
     origin = surface.bounds.mean(axis=0) if isinstance(surface, StoredSurface) else surface.origin
     position, normal = found.position[used], found.normal[used]
     colors = colors_at(surface, position, normal, device)
     report("triangles", 1.0)
     return Mesh((position - origin).astype(np.float32), faces, normal.astype(np.float32), colors, origin=origin)
+
+
+def _corner(surface, which: int) -> str:
+    return "(" + ", ".join(f"{value:.10g}" for value in surface.bounds[which]) + ")"
 
 
 def _numbered(faces: NDArray) -> tuple[NDArray, NDArray]:
@@ -169,8 +176,7 @@ def _kept(faces: NDArray, found: _Vertices) -> NDArray:
     a, b, c = (found.place[faces[:, k]] for k in range(3))
     up = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.normal[faces].sum(axis=1))
     # Half way between two sheets that face the same side the sign changes too, the wrong way round.
-    faces = faces[(up > 0) & found.near[faces].all(axis=1)]
-    on = found.inside[faces].any(axis=1)
+    on = (up > 0) & found.near[faces].all(axis=1) & found.inside[faces].any(axis=1)
     on |= _enclosed(faces, ~on)
     return _without_specks(faces[on])
 
@@ -201,8 +207,9 @@ def _drawn_in(surface, faces: NDArray, found: _Vertices, spacing: float, device:
     found.position[rim[moved]], found.normal[rim[moved]] = near.position[moved], near.normal[moved]
 
 
-def _components(faces: NDArray, chosen: NDArray) -> tuple[int, NDArray, NDArray]:
-    """Return the number of connected parts of chosen faces, each one's part (n,), and how many open edges it has.
+def _components(faces: NDArray, chosen: NDArray) -> tuple[int, NDArray, NDArray, NDArray]:
+    """Return the number of connected parts (k) of chosen faces, each face's part (f,), and of the parts how many open
+    edges they have (k,), and whether they border on faces that are not chosen (k,) bool.
 
     Faces are connected by common edges; an edge is open that has one face among all.
     """
@@ -216,16 +223,15 @@ def _components(faces: NDArray, chosen: NDArray) -> tuple[int, NDArray, NDArray]
     both = chosen[one] & chosen[other]
     graph = sparse.coo_matrix((np.ones(int(both.sum()), bool), (one[both], other[both])), (len(faces), len(faces)))
     count, part = csgraph.connected_components(graph, directed=False)
-    rim = single.reshape(-1, 3).sum(axis=1)
-    return count, part, np.bincount(part, rim, count)
+    borders = np.zeros(count, bool)
+    borders[part[np.concatenate([one[~both], other[~both]])]] = True
+    return count, part, np.bincount(part, single.reshape(-1, 3).sum(axis=1), count), borders
 
 
 def _enclosed(faces: NDArray, off: NDArray) -> NDArray:
     """Return which of the faces `off` the surface are small patches amid ones that are on it: no hole, but a crease."""
-    if not off.any():
-        return off
-    count, part, rim = _components(faces, off)
-    small = (np.bincount(part, off, count) <= SPECK) & (rim == 0)
+    count, part, rim, borders = _components(faces, off)
+    small = (np.bincount(part, off, count) <= SPECK) & (rim == 0) & borders
     return off & small[part]
 
 
@@ -233,7 +239,7 @@ def _without_specks(faces: NDArray) -> NDArray:
     """Return the faces without open fragments of a few."""
     if not len(faces):
         return faces
-    count, part, rim = _components(faces, np.ones(len(faces), bool))
+    count, part, rim, _ = _components(faces, np.ones(len(faces), bool))
     return faces[((np.bincount(part, minlength=count) > SPECK) | (rim == 0))[part]]
 
 
