@@ -12,6 +12,7 @@ from clsurf.build import sparse_grid, streamed, to_mesh
 from clsurf.build.marching import EDGES, marching_cubes, triangle_table
 from clsurf.build.sparse_grid import NearCells, coordinates, keys_of, stepped
 from clsurf.errors import Cancelled, InputError
+from clsurf.io.stored_leaves import BYTES
 
 FAR = np.array([7_691_239.553, 637_291.25, 851.5])
 MAJOR, MINOR = 1.0, 0.4
@@ -177,13 +178,15 @@ def test_surfaces_in_their_store_become_the_same_mesh(device, tmp_path, monkeypa
     write_las(tmp_path / "hills.las", *ground(20_000))
     monkeypatch.setattr(streamed, "sizes_of", lambda limit: streamed.Sizes(10_000, 4_000, 3_000))
     place = clsurf.build_slim(tmp_path / "hills.las", error=0.003, out=tmp_path / "a.clsurf", device=device).place
-    stored = clsurf.open_surface(place)
+    stored = clsurf.open_surface(place, budget=BYTES * len(clsurf.open_surface(place)) * 6 // 10)
     assert len(stored.surfels) > 2
     one, other = clsurf.to_mesh(stored, 1.5, device=device), clsurf.to_mesh(stored.load(), 1.5, device=device)
     assert len(one.faces) == pytest.approx(len(other.faces), rel=0.01)
     assert np.abs(clsurf.project(stored.load(), one.vertices + one.origin, device).distance).max() < 0.05
     assert as_trimesh(one).area == pytest.approx(as_trimesh(other).area, rel=0.01)
     assert len(clsurf.to_mesh(stored, device=device).faces) > 1000
+    at_once = clsurf.to_mesh(clsurf.open_surface(place), 1.5, device=device)  # its budget holds all of it
+    assert np.array_equal(at_once.faces, other.faces)
 
 
 def test_other_surfaces_give_the_triangles_that_they_have(device):

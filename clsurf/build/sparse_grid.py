@@ -197,14 +197,16 @@ def _refined(surface, spacing, device, report, most_cells) -> NearCells | float:
     level = max(1, int(np.ceil(np.log2(size.max() / finest / TOP_CELLS))))
     count = np.ceil(size / (finest * 2**level)).astype(int)
     keys = np.sort(keys_of(np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 3)))
+    expected = np.inf
     while True:
         edge = finest * 2**level
         away = distances(surface, low + edge / 2, edge, keys, device, report, "cells near the surface")
         keys = keys[np.abs(away) <= NEAR * edge]
-        expected = 2.0 * len(keys) * (edge / spacing) ** 2
+        before, expected = expected, 2.0 * len(keys) * (edge / spacing) ** 2
+        growth = np.clip(expected / max(before, 1), 1, 1.5)
         if expected > most_cells:
-            # Areas grow by four a level, vegetation and noise by more: the next level looks again.
-            return spacing * max(1.05, np.sqrt(expected / most_cells))
+            # Areas grow by four a level; vegetation and noise by more, as they did by the last one.
+            return float(spacing * max(1.05, np.sqrt(expected * growth ** (level - 1) / most_cells)))
         if level == 1:
             return NearCells(low, spacing, keys) if finest == spacing else finest
         level -= 1

@@ -19,7 +19,7 @@ from ..surface.scale_mesh import scale_mesh
 from ..surface.surfel import SurfelHierarchy
 from .marching import marching_cubes
 from .place_colors import colors_at
-from .places import check_surface, checked_spacing, drawn_at, oriented, spacing_of
+from .places import check_surface, checked_spacing, drawn_at, in_memory, oriented, spacing_of
 from .project import project
 from .sparse_grid import SparseGrid, distances, near_cells, projected, reporter, stepped
 
@@ -52,7 +52,7 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
     surface : SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh or Placed
     spacing : float, optional
         World units: edge of the grid's cells, about the length of the triangles' edges. By default a quarter of the
-        median radius of the leaves, of hierarchies `surfaces.spacing`, or larger where the grid would have more than 8
+        median radius of the leaves, of hierarchies `surface.spacing`, or larger where the grid would have more than 8
         million cells (3 million vertices). Patches, scale maps and meshes have their own and ignore it.
     progress : callable, optional
         Called as progress(stage, done) with done from 0 to 1; returning False stops the work.
@@ -86,6 +86,7 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
     if isinstance(surface, SurfelHierarchy) and surface.hybrid:
         return surface.mesh
     check_surface(surface)
+    surface = in_memory(surface)
     if not oriented(surface):
         raise InputError("surface: expected normals with a side, got an unoriented surface (.slim2t of negative "
                          "degree): to_points takes it")

@@ -13,7 +13,7 @@ from ..surface.placed import Placed
 from ..surface.slim import SlimSurface
 from ..surface.surfel import SurfelHierarchy
 from .place_colors import colors_at
-from .places import check_surface, checked_spacing, drawn_at, oriented, spacing_of
+from .places import check_surface, checked_spacing, drawn_at, in_memory, oriented, spacing_of
 from .project import project
 from .sparse_grid import CHUNK, NearCells, coordinates, near_cells, reporter
 
@@ -66,6 +66,7 @@ def to_points(surface, spacing=None, progress=None, device=None) -> PointCloud:
                           (part.normals @ linear.T / surface.scale).astype(np.float32), part.colors,
                           origin=linear @ part.origin + surface.matrix[:3, 3])
     check_surface(surface)
+    surface = in_memory(surface)
     if isinstance(surface, PatchSurface):
         surface = patch_mesh(surface)
     device, report = open_device(device), reporter("to_points", progress)
