@@ -21,10 +21,10 @@ from .marching import marching_cubes
 from .place_colors import colors_at
 from .places import check_surface, checked_spacing, drawn_at, in_memory, oriented, spacing_of
 from .project import project
-from .sparse_grid import SparseGrid, distances, near_cells, projected, reporter, stepped
+from .sparse_grid import CHUNK, SparseGrid, distances, near_cells, projected, reporter, stepped
 
-MOST_CELLS = 3.2e7  # of a spacing that was asked for: 2 GB, and 12 million vertices
-DEFAULT_CELLS = 8e6  # of one that is chosen here
+MOST_CELLS = 1.6e7  # of a spacing that was asked for: 6 million vertices, 3 GB
+DEFAULT_CELLS = 8e6  # of one that is chosen here: 2 GB
 # All lengths in spacings.
 LONGEST = 1.5  # of the two distances at a crossed edge: 1 where a flat surface crosses it
 SHARE = 0.1  # an edge is crossed this far from its ends at least: no needles, and the projection puts it right
@@ -52,8 +52,8 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
     surface : SlimSurface, StoredSurface, PatchSurface, SurfelHierarchy, ScaleMap, Mesh or Placed
     spacing : float, optional
         World units: edge of the grid's cells, about the length of the triangles' edges. By default a quarter of the
-        median radius of the leaves, of hierarchies `surface.spacing`, or larger where the grid would have more than 8
-        million cells (3 million vertices). Patches, scale maps and meshes have their own and ignore it.
+        median radius of the leaves, of hierarchies `surface.spacing`, or larger where the mesh would have more than
+        about 3 million vertices (2 GB). Patches, scale maps and meshes have their own and ignore it.
     progress : callable, optional
         Called as progress(stage, done) with done from 0 to 1; returning False stops the work.
     device : None, str or Device
@@ -68,7 +68,7 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
     ------
     InputError
         A scan of points (`build_slim` makes a surface of it), a surface without leaves or without an orientation, a
-        spacing that is no length or that makes more than 12 million vertices.
+        spacing that is no length, makes more than about 6 million vertices (3 GB), or is as large as the surface.
     DeviceMemoryError
     Cancelled
         `progress` returned False.
@@ -221,8 +221,12 @@ def _move(faces: NDArray, found: _Vertices, some: NDArray, positions: NDArray, n
 
 def _rise(positions: NDArray, normals: NDArray, faces: NDArray) -> NDArray:
     """Return above 0 for faces (f,) that look the way that the normals (v, 3) of their corners do."""
-    a, b, c = (positions[faces[:, k]] for k in range(3))
-    return np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[faces].sum(axis=1))
+    out = np.empty(len(faces))
+    for start in range(0, len(faces), CHUNK):
+        some = faces[start:start + CHUNK]
+        a, b, c = (positions[some[:, k]] for k in range(3))
+        out[start:start + CHUNK] = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[some].sum(axis=1))
+    return out
 
 
 def _components(faces: NDArray, chosen: NDArray) -> tuple[int, NDArray, NDArray, NDArray]:
@@ -248,9 +252,13 @@ def _components(faces: NDArray, chosen: NDArray) -> tuple[int, NDArray, NDArray,
 
 def _enclosed(faces: NDArray, off: NDArray) -> NDArray:
     """Return which of the faces `off` the surface are small patches amid ones that are on it: no hole, but a crease."""
-    count, part, rim, borders = _components(faces, off)
-    small = (np.bincount(part, off, count) <= SPECK) & (rim == 0) & borders
-    return off & small[part]
+    out, touched = np.zeros(len(faces), bool), np.zeros(int(faces.max(initial=-1)) + 1, bool)
+    touched[faces[off]] = True
+    some = np.flatnonzero(touched[faces].any(axis=1))  # they and their neighbours
+    count, part, rim, borders = _components(faces[some], off[some])
+    small = (np.bincount(part, off[some], count) <= SPECK) & (rim == 0) & borders
+    out[some] = off[some] & small[part]
+    return out
 
 
 def _without_specks(faces: NDArray) -> NDArray:
