@@ -1,5 +1,7 @@
 """Meshes of surfaces: on the surface, closed where it is, ending where it ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -10,9 +12,10 @@ from test_build_surfels import uv_sphere
 import clsurf
 from clsurf.build import sparse_grid, streamed, to_mesh
 from clsurf.build.marching import EDGES, marching_cubes, triangle_table
+from clsurf.build.sides import turned_over
 from clsurf.build.sparse_grid import NearCells, coordinates, keys_of, stepped
 from clsurf.errors import Cancelled, InputError
-from clsurf.io.stored_leaves import BYTES
+from clsurf.io.stored_leaves import BYTES, only
 
 FAR = np.array([7_691_239.553, 637_291.25, 851.5])
 MAJOR, MINOR = 1.0, 0.4
@@ -200,6 +203,26 @@ def test_other_surfaces_give_the_triangles_that_they_have(device):
     assert as_trimesh(clsurf.to_mesh(scales)).is_watertight
     matrix = np.diag([2.0, 2, 2, 1])
     assert np.allclose(clsurf.to_mesh(mesh.moved(matrix)).vertices, 2 * mesh.vertices)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_an_unoriented_surface_gets_its_sides_first(degree, device):
+    surface = clsurf.build_slim(clsurf.models.torus(8000), degree=degree, device=device)
+    some = np.flatnonzero(np.random.default_rng(0).uniform(size=len(surface)) < 0.4)
+    mixed = replace(turned_over(surface, some), oriented=False)
+    # What is turned over is where it was, and back again what it was.
+    back = turned_over(mixed, some)
+    assert np.allclose(back.coefficients, surface.coefficients, atol=1e-4 * np.abs(surface.coefficients).max())
+    leaf = some[surface.leaf[some]]
+    for k in leaf[:20]:
+        alone = [only(one, np.array([k])) for one in (surface, mixed)]
+        places = alone[0].centers + 0.3 * alone[0].radii[0] * np.random.default_rng(k).normal(size=(50, 3))
+        near = [clsurf.project(one, places + surface.origin, device) for one in alone]
+        assert np.abs(near[0].position - near[1].position).max() < 1e-4
+        assert np.allclose(near[0].distance, -near[1].distance, atol=1e-4)
+    mesh = clsurf.to_mesh(mixed, 0.08, device=device)
+    shape = as_trimesh(mesh)
+    assert shape.is_watertight and shape.euler_number == 0 and shape.volume > 0 and rises(mesh).min() > 0.7
 
 
 def test_surfels_without_triangles_are_meshed(device):

@@ -21,6 +21,7 @@ from .marching import marching_cubes
 from .place_colors import colors_at
 from .places import check_surface, checked_spacing, drawn_at, in_memory, oriented, spacing_of
 from .project import project
+from .sides import with_sides
 from .sparse_grid import CHUNK, SparseGrid, distances, near_cells, projected, reporter, stepped
 
 MOST_CELLS = 1.6e7  # of a spacing that was asked for: 6 million vertices, 3 GB
@@ -40,9 +41,10 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
 
     SLIM surfaces, in memory or in their store, and surfel hierarchies without triangles: marching cubes of the blended
     surface on a grid of edge `spacing` that has cells near the surface only, the vertices projected onto it. The mesh
-    of a closed surface is closed; open ones end where they are drawn to end, to about half a spacing. Sheets nearer to
-    each other than a spacing or two are kept apart, but where no node of the grid lies between them, a thin wall has
-    holes: take a smaller spacing. Holes of the surface smaller than a spacing or two close.
+    of a closed surface is closed; open ones end where they are drawn to end. Sheets nearer to each other than a spacing
+    or two are kept apart, but where no node of the grid lies between them, a thin wall has holes: take a smaller
+    spacing. Holes of the surface smaller than a spacing or two close. The sides of an unoriented surface (.slim2t of
+    negative degree) are found first.
 
     Spatial patches become their nodes, two triangles a cell (overlaps overlap), scale maps their texels, hybrid surfel
     hierarchies their mesh; a mesh stays as it is.
@@ -67,8 +69,8 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
     Raises
     ------
     InputError
-        A scan of points (`build_slim` makes a surface of it), a surface without leaves or without an orientation, a
-        spacing that is no length, makes more than about 6 million vertices (3 GB), or is as large as the surface.
+        A scan of points (`build_slim` makes a surface of it), a surface without leaves, a spacing that is no length,
+        makes more than about 6 million vertices (3 GB), or is as large as the surface.
     DeviceMemoryError
     Cancelled
         `progress` returned False.
@@ -87,10 +89,13 @@ def to_mesh(surface, spacing=None, progress=None, device=None) -> Mesh:
         return surface.mesh
     check_surface(surface)
     surface = in_memory(surface)
+    device = open_device(device)
     if not oriented(surface):
-        raise InputError("surface: expected normals with a side, got an unoriented surface (.slim2t of negative "
-                         "degree): to_points takes it")
-    return _marched(surface, spacing, open_device(device), reporter("to_mesh", progress))
+        if isinstance(surface, StoredSurface):
+            raise InputError("surface: expected normals with a side, or a budget that holds it whole, got an "
+                             "unoriented surface in its store: to_points takes it")
+        surface = with_sides(surface, device)
+    return _marched(surface, spacing, device, reporter("to_mesh", progress))
 
 
 def placed_mesh(mesh: Mesh, at: Placed) -> Mesh:
