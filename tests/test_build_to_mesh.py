@@ -312,3 +312,12 @@ def test_the_bunny(device):
     assert found.rms < 1.3 * clsurf.error(surface, scan, device=device).rms
     assert found.backward.percentile(99) < 0.001 * found.diagonal
     assert np.sort(rises(mesh))[10] > 0.5
+
+
+def test_sharp_edges_close(device):
+    """Fandisk: balls beside an edge end at it, and not every place between them is drawn."""
+    scan = clsurf.load(scan_path("denoise/Fandisk0.3/Original.obj"))
+    mesh = clsurf.to_mesh(clsurf.build_slim(scan, device=device), device=device)
+    shape = as_trimesh(mesh)
+    assert shape.is_watertight and shape.euler_number == 2 and shape.body_count == 1
+    assert clsurf.error(mesh, scan, device=device).relative.rms < 5e-4

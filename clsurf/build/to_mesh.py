@@ -187,13 +187,11 @@ def _kept(faces: NDArray, found: _Vertices) -> NDArray:
 
 def _drawn_in(surface, faces: NDArray, found: _Vertices, spacing: float, device: Device) -> None:
     """Move the vertices beyond the border to where the surface ends, each towards its neighbours on the surface."""
-    after = np.roll(faces, -1, axis=1).ravel()
-    one, other = np.append(faces.ravel(), after), np.append(after, faces.ravel())
-    pairs = ~found.inside[one] & found.inside[other]
-    rim, at = np.unique(one[pairs], return_inverse=True)
+    one, other = _beyond_border(faces, found.inside)
+    rim, at = np.unique(one, return_inverse=True)
     if not len(rim):
         return
-    place, normal = (np.stack([np.bincount(at, array[other[pairs], k]) for k in range(3)], axis=1) /
+    place, normal = (np.stack([np.bincount(at, array[other, k]) for k in range(3)], axis=1) /
                      np.bincount(at)[:, None] for array in (found.position, found.normal))
     way, turn = found.position[rim] - place, found.normal[rim] - normal
     low, high = np.full(len(rim), LEAST), np.ones(len(rim))
@@ -205,6 +203,21 @@ def _drawn_in(surface, faces: NDArray, found: _Vertices, spacing: float, device:
         low, high = np.where(drawn, share, low), np.where(drawn, high, share)
     near = project(surface, place + low[:, None] * way, device)
     _move(faces, found, rim, near.position, near.normal)
+
+
+def _beyond_border(faces: NDArray, inside: NDArray) -> tuple[NDArray, NDArray]:
+    """Return pairs (k,), (k,) of vertices that share an edge: one beyond the border, and one on the surface."""
+    some = faces[~inside[faces].all(axis=1)]
+    first, second = some.ravel(), np.roll(some, -1, axis=1).ravel()
+    # Vertices that are not drawn lie at creases too, amid faces: only those at edges of a single face are moved.
+    key = np.minimum(first, second) * len(inside) + np.maximum(first, second)
+    _, index, count = np.unique(key, return_index=True, return_counts=True)
+    open_edges = index[count == 1]
+    at_border = np.zeros(len(inside), bool)
+    at_border[first[open_edges]] = at_border[second[open_edges]] = True
+    one, other = np.append(first, second), np.append(second, first)
+    pairs = ~inside[one] & at_border[one] & inside[other]
+    return one[pairs], other[pairs]
 
 
 def _move(faces: NDArray, found: _Vertices, some: NDArray, positions: NDArray, normals: NDArray) -> None:
