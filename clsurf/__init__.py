@@ -20,6 +20,8 @@ from .build.project import Projection, project
 from .build.scale_map import build_scale_map
 from .build.slim import build_slim
 from .build.surfels import build_surfels
+from .build.to_mesh import to_mesh
+from .build.to_points import to_points
 from .device import Device, Profile, open_device
 from .errors import Error
 from .io import load, load_frames, save
@@ -62,5 +64,5 @@ __all__ = [
     "build_slim", "build_surfels", "color_map", "curvature", "error", "errors", "estimate_normals", "line_channels",
     "line_surface", "lines", "load", "load_cameras", "load_frames", "models", "morph", "open_device", "open_surface",
     "project", "render", "render_frames", "report", "save", "save_cameras", "slim_of_error", "smooth", "sparsity",
-    "trace", "turntable", "view", "write_video",
+    "to_mesh", "to_points", "trace", "turntable", "view", "write_video",
 ]

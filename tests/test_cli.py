@@ -96,6 +96,38 @@ def test_build_info_render_convert(scan, tmp_path, capsys, on_device):
     assert len(clsurf.load(tmp_path / "ball.xyz").points) == 4000
 
 
+@pytest.mark.parametrize("ending", ["ply", "obj", "stl", "off", "glb", "npz", "xyz", "txt", "asc", "pts", "csv", "npy",
+                                    "las", "laz"])
+def test_a_surface_converts_to_every_format(ending, scan, tmp_path, capsys, on_device):
+    """Triangles where the format has them, else evenly spread points; colours where it has those."""
+    surface, out = tmp_path / "ball.clsurf", tmp_path / f"out.{ending}"
+    assert main(["build", str(scan), str(surface), "-q"]) == 0
+    assert main(["convert", str(surface), str(out), "--spacing", "0.3"]) == 0
+    points = ending in ("xyz", "txt", "asc", "pts", "csv", "npy", "las", "laz")
+    assert ("points " if points else "mesh ") in capsys.readouterr().err
+    back = clsurf.load(out)
+    assert isinstance(back, clsurf.PointCloud if points else clsurf.Mesh)
+    radius = np.linalg.norm(back.points + (back.origin - 100), axis=1)
+    assert np.abs(radius - 2).max() < 0.02 and 200 < len(radius) < 2000
+    if ending not in ("stl",):
+        assert np.abs(back.colors[:, :3].astype(int) - (20, 255, 255)).max() <= 1
+
+
+def test_what_cannot_be_converted_is_one_line(scan, tmp_path, capsys, on_device):
+    surface = tmp_path / "ball.clsurf"
+    assert main(["build", str(scan), str(surface), "-q"]) == 0
+    for arguments, says in (([surface, "a.ply", "--spacing", "-1"], "spacing: expected a length"),
+                            ([surface, "a.ply", "--spacing", "1e-9"], "spacing: expected at least"),
+                            ([surface, "a.ply", "--spacing", "99"], "spacing: expected a smaller one"),
+                            ([surface, "a.clsurf", "--spacing", "1"], "spacing: expected a surface and a format"),
+                            ([scan, "a.xyz", "--spacing", "1"], "spacing: expected a surface and a format")):
+        arguments[1] = tmp_path / arguments[1]
+        assert main(["convert", *map(str, arguments), "-q"]) == 2
+        said = capsys.readouterr().err.strip().splitlines()
+        assert said[-1].startswith("clsurf: ") and says in said[-1] and "Traceback" not in "".join(said)
+        assert not arguments[1].exists()
+
+
 def test_quiet_says_nothing(scan, tmp_path, capsys, on_device):
     level = logging.getLogger("clsurf").level
     assert main(["build", str(scan), str(tmp_path / "b.clsurf"), "--quiet"]) == 0

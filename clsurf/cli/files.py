@@ -192,29 +192,37 @@ def build(scan: Annotated[Path, typer.Argument(help="A scan: PLY OBJ STL OFF GLB
 
 
 def convert(source: Annotated[Path, typer.Argument(help="A scan or a surface.")],
-            out: Annotated[Path, typer.Argument(help="The file to write; its ending chooses the format. Patches "
-                                                "become their nodes, joined by two triangles a cell where the format "
-                                                "has faces, scale maps likewise their texels; surfel hierarchies their "
-                                                "base surfels, or mesh.")],
-            quiet: QuietOption = False):
+            out: Annotated[Path, typer.Argument(help="The file to write; its ending chooses the format. In formats of "
+                                                "meshes surfaces become triangles: SLIM surfaces and surfels are "
+                                                "meshed, patches their nodes, scale maps their texels, hybrid surfels "
+                                                "their mesh. In formats of points (XYZ TXT ASC PTS CSV NPY LAS LAZ) "
+                                                "they become evenly spread points.")],
+            spacing: Annotated[float | None, typer.Option(help="World units: length of the triangles' edges, distance "
+                                                          "of the points [from the surface].")] = None,
+            device: DeviceOption = "", quiet: QuietOption = False):
     """Write a scan or a surface in another format."""
     import clsurf
 
+    from ..build.places import checked_spacing
     from ..io.dispatch import WRITES
+    from ..io.scans import POINTS
     from ..io.scans import WRITES as SCANS
-    from ..surface.patch_mesh import patch_mesh
-    from ..surface.scale_mesh import scale_mesh
-    from ..surface.surfel import finest_scan
     steps = Steps(quiet)
     checked_out(out, WRITES)
+    checked_spacing(spacing)
     with steps.step("load"):
         thing = clsurf.load(source)
     steps.say(f"  {thing}")
-    if isinstance(thing, clsurf.PatchSurface | clsurf.SurfelHierarchy) and out.suffix.lower() in SCANS:
-        thing = patch_mesh(thing) if isinstance(thing, clsurf.PatchSurface) else finest_scan(thing)
-        steps.say(f"  {thing}")
-    if isinstance(thing, clsurf.ScaleMap) and out.suffix.lower() in SCANS:
-        thing = scale_mesh(thing)
+    ending = out.suffix.lower()
+    resampled = ending in SCANS and (is_surface(thing) or (spacing is not None and isinstance(thing, clsurf.Mesh) and
+                                                           ending in POINTS))
+    if spacing is not None and not resampled:
+        raise InputError(f"spacing: expected a surface and a format of meshes or points, or a mesh and one of points, "
+                         f"got {source} ({type(thing).__name__}) and {out}")
+    if resampled:
+        make = clsurf.to_points if ending in POINTS else clsurf.to_mesh
+        with steps.step("points" if ending in POINTS else "mesh"):
+            thing = make(thing, spacing, steps.progress, device or None)
         steps.say(f"  {thing}")
     with steps.step("save"):
         clsurf.save(thing, out)

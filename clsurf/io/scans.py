@@ -120,6 +120,7 @@ _HOLDS = {".ply": "faces normals colors uv attributes", ".obj": "faces normals c
 
 READS = tuple(_FORMATS)
 WRITES = tuple(ending for ending, (*_, writer) in _FORMATS.items() if writer)
+POINTS = tuple(ending for ending in WRITES if "faces" not in _HOLDS[ending].split())  # formats without triangles
 
 
 def _format_of(path, purpose: str):
