@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..device import Device
 from ..errors import InputError
 from ..io.stored import StoredSurface
+from ..surface.arrays import lengths_of
 from ..surface.cloud import PointCloud
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
@@ -74,7 +75,7 @@ def spacing_of(surface) -> float:
 def _edge_of(mesh: Mesh) -> float:
     """Return the root of twice the mean area of a mesh's faces: the edge of right angles of that area."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    area = np.nan_to_num(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    area = np.nan_to_num(lengths_of(np.cross(b - a, c - a)))
     if not area.sum() > 0:
         raise InputError("surface: expected faces with some area, got none")
     return float(np.sqrt(area.mean()))

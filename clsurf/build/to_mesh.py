@@ -10,6 +10,7 @@ from scipy.sparse import csgraph
 from ..device import Device, open_device
 from ..errors import InputError
 from ..io.stored import StoredSurface
+from ..surface.arrays import lengths_of
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
@@ -170,8 +171,8 @@ def _on_surface(surface, grid: SparseGrid, ends, share, device: Device, report) 
     for rows, near in projected(surface, place, device, report, "vertices"):
         found.position[rows], found.normal[rows] = near.position, near.normal
         moved = near.position - place[rows]
-        beside = np.linalg.norm(moved - (moved * near.normal).sum(axis=1, keepdims=True) * near.normal, axis=1)
-        found.near[rows] = np.linalg.norm(moved, axis=1) <= FARTHEST * grid.spacing
+        beside = lengths_of(moved - (moved * near.normal).sum(axis=1, keepdims=True) * near.normal)
+        found.near[rows] = lengths_of(moved) <= FARTHEST * grid.spacing
         found.inside[rows] = ((beside <= BESIDE * grid.spacing) &
                               drawn_at(surface, near.position, near.normal, grid.spacing / 2, device))
     return found
@@ -198,7 +199,7 @@ def _drawn_in(surface, faces: NDArray, found: _Vertices, spacing: float, device:
     for _ in range(BISECTIONS):
         share = (low + high) / 2
         there = normal + share[:, None] * turn
-        there /= np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-300)
+        there /= np.maximum(lengths_of(there, keepdims=True), 1e-300)
         drawn = drawn_at(surface, place + share[:, None] * way, there, spacing / 2, device)
         low, high = np.where(drawn, share, low), np.where(drawn, high, share)
     near = project(surface, place + low[:, None] * way, device)

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from ..device import Device, open_device
 from ..io.stored import StoredSurface
+from ..surface.arrays import box_of
 from ..surface.cloud import PointCloud
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
@@ -91,7 +92,8 @@ def _spread(surface, near: NearCells, device: Device, report) -> tuple[NDArray, 
         place, normal = _places(surface, near, slice(start, start + rows), device)
         if not len(place):
             continue
-        low, high = place.min(axis=0) - spacing, place.max(axis=0) + spacing
+        low, high = box_of(place)
+        low, high = low - spacing, high + spacing
         beside = ((positions >= low) & (positions <= high)).all(axis=1)
         sides = (normal, normals[beside]) if sided else (np.zeros_like(normal), np.zeros_like(normals[beside]))
         chosen = spread_out(place, sides[0], spacing, positions[beside], sides[1])
