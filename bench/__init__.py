@@ -1,6 +1,6 @@
 """Benchmarks: each job checks its answer, then prints figures with the device, driver, commit and scene beside them.
 
-`clsurf bench build|tiles|normals|scans|patches|surfels|scale_map [--json FILE]`, `clsurf bench compare A B`;
+`clsurf bench build|tiles|normals|scans|patches|surfels|scale_map|first [--json FILE]`, `clsurf bench compare A B`;
 `python -m bench.report FILE` runs all.
 """
 
@@ -24,6 +24,7 @@ JOBS = {
     "instances": "ten placements of a model: memory of the device and the host over that of one",
     "view": "the viewer: pictures a second while something moves, drawn alone and end to end to a browser",
     "scale_map": "spherical scale maps: closed forms and orders, builds, frames, geospheres, morphs",
+    "first": "what one waits for: import, first pictures, surfaces as meshes and points",
     "stream": "scans larger than memory: time, peak memory, autzen's points within 0.3 m, scaling to 50 million points",
     "patches": "spatial patches: conversions, frames and modes, VTK, the paper's tables",
 }
