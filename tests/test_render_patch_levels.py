@@ -1,6 +1,8 @@
 """Mip levels of patches, their choice on the device, and the culling of back faces."""
 
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reference import render_patch_modes as twin
@@ -48,6 +50,23 @@ def test_levels_keep_the_outline(size):
         for a, b in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
             assert np.abs(nodes[a, b] - fine[a, b]).max() < 2e-6
         assert np.abs((nodes - fine[0, 0]) @ normal).max() < 2e-5
+
+
+def test_levels_weigh_colours_by_their_alpha():
+    """One colour stays that colour whatever the alphas, which are averaged; what is nearly clear colours nothing."""
+    rng = np.random.default_rng(6)
+    alpha = rng.integers(1, 256, 81)
+    flat = PatchSurface(np.zeros((1, 3)), [[1, 0, 0]], [[0, 1, 0]], [0.1], (9, 9), np.zeros(81, np.int8),
+                        np.column_stack([np.full((81, 3), (200, 90, 30)), alpha]))
+    level = halved(flat)
+    assert np.abs(level.colors[:, :3].astype(int) - (200, 90, 30)).max() <= 1
+    kernel = np.outer([1, 2, 1], [1, 2, 1]) / 16
+    mean = (alpha.reshape(9, 9)[1:4, 1:4] * kernel).sum()
+    assert abs(int(level.colors.reshape(5, 5, 4)[1, 1, 3]) - mean) <= 1
+    clear = np.arange(81) % 2 == 1
+    colors = np.where(clear[:, None], (0, 0, 255, 1), (255, 0, 0, 255))
+    mixed = halved(replace(flat, colors=colors.astype(np.uint8)))
+    assert (mixed.colors[:, 0] > 250).all() and (mixed.colors[:, 2] < 30).all()
 
 
 def test_levels_average_linear_light_and_keep_most_of_what_shows():
