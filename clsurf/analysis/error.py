@@ -27,7 +27,7 @@ from ..surface.placed import Placed
 from ..surface.ranges import RangeScan
 from ..surface.scale_map import ScaleMap
 from ..surface.scale_mesh import scale_mesh
-from ..surface.slim import SlimSurface, frame_of_normals
+from ..surface.slim import SlimSurface, frame_of_normals, powers
 from ..surface.surfel import SurfelHierarchy
 
 MEASURED = SlimSurface | StoredSurface | PatchSurface | SurfelHierarchy | ScaleMap
@@ -242,9 +242,8 @@ def _disc_points(surface: SlimSurface, count: int, random) -> NDArray:
         chosen, u, v = chosen[inside], u[inside], v[inside]
     radius = surface.radii[chosen].astype(np.float64)
     u, v = u * radius, v * radius
-    powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=1)
     coefficients = surface.coefficients[chosen].astype(np.float64)
-    w = (powers[:, :coefficients.shape[1]] * coefficients).sum(axis=1)
+    w = (powers(u, v)[:, :coefficients.shape[1]] * coefficients).sum(axis=1)
     normal = surface.normals[chosen].astype(np.float64)
     axis_u, axis_v = frame_of_normals(normal)
     return (surface.centers[chosen] + u[:, None] * axis_u + v[:, None] * axis_v

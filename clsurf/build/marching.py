@@ -3,7 +3,8 @@
 Source: Lorensen, Cline, "Marching Cubes: A High Resolution 3D Surface Construction Algorithm", SIGGRAPH 1987. The table
 is made, not typed in: on each face of a cube every run of inside corners is cut off by one segment, which is the same
 seen from both of its cells, and the loops of segments are triangulated without a diagonal that lies in a face. So no
-edge has more than two triangles, and a surface that does not leave the cells is closed.
+edge has more than two triangles, and a surface that does not leave the cells is closed. scikit-image's takes dense
+boxes: their seams would have to be welded, and a large thin surface has no room in one.
 """
 
 from functools import lru_cache

@@ -66,5 +66,5 @@ def _node_colors(colors, opaque, precise):
         out = np.concatenate([out, np.full((len(out), 1), 255, np.uint8)], axis=1)
     if out.shape[1] == 3:
         out |= ((out[:, 0] | out[:, 1] | out[:, 2]) == 0)[:, None]
-    out *= opaque[:, None]  # by indices, as the line before, 5 times as long
+    out *= opaque[:, None]  # out[~opaque] = 0 takes 5 times as long
     return out

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device import Device
-from ..surface.slim import SlimSurface, frame_of_normals
+from ..surface.slim import SlimSurface, frame_of_normals, powers
 from .orientation import signs_of
 
 _DEGREE = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3])  # of a polynomial's terms
@@ -39,15 +39,11 @@ def turned_over(surface: SlimSurface, some: NDArray) -> SlimSurface:
     old, new = frame_of_normals(normals), frame_of_normals(-normals)
     in_old = [u * np.einsum("ij,ij->i", new[0], axis)[:, None] + v * np.einsum("ij,ij->i", new[1], axis)[:, None]
               for axis in old]
-    height = np.einsum("nkm,nm->nk", _powers(*in_old)[..., :terms], surface.coefficients[some] * size)
+    height = np.einsum("nkm,nm->nk", powers(*in_old)[..., :terms], surface.coefficients[some] * size)
     all_normals, coefficients = surface.normals.copy(), surface.coefficients.copy()
     all_normals[some] = -normals
-    coefficients[some] = -(height @ np.linalg.pinv(_powers(u, v)[:, :terms]).T) / size
+    coefficients[some] = -(height @ np.linalg.pinv(powers(u, v)[:, :terms]).T) / size
     footprint = None if surface.footprint is None else surface.footprint.copy()
     if footprint is not None:
         footprint[some] = 255
     return replace(surface, normals=all_normals, coefficients=coefficients, footprint=footprint)
-
-
-def _powers(u: NDArray, v: NDArray) -> NDArray:
-    return np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=-1)

@@ -10,12 +10,13 @@ from scipy.spatial import cKDTree
 from ..device import Device
 from ..surface.arrays import extent_of
 from ..surface.slim import segment_end
+from .morton import AXIS_BITS, unmorton
 from .neighbours import box_tree
 from .normals import suitable_k
 from .point_tree import BLOCK, build_point_tree
 from .radius import Noise, neighbour_spreads, noise_of, robust_box
 from .slim_levels import LEVELS
-from .stream_runs import AXIS_BITS, THINNED, Runs, unmorton
+from .stream_runs import THINNED, Runs
 
 PIECES, PIECE_POINTS = 24, 1024  # places where noise and spacing are measured, and points of each
 LARGEST = 16.0  # r_c: largest radius of a cell's surfels, point spacings (of 1/16 copies: 4 of the copy's)

@@ -10,7 +10,7 @@ from scipy.sparse import csgraph
 from ..device import Device, open_device
 from ..errors import InputError
 from ..io.stored import StoredSurface
-from ..surface.arrays import lengths_of
+from ..surface.arrays import lengths_of, used_numbers
 from ..surface.mesh import Mesh
 from ..surface.patch import PatchSurface
 from ..surface.patch_mesh import patch_mesh
@@ -290,6 +290,6 @@ def _without_specks(faces: NDArray) -> NDArray:
 
 def _used(faces: NDArray, count: int) -> tuple[NDArray, NDArray]:
     """Return the vertices that faces use, and the faces in their numbers."""
-    use = np.zeros(count, bool)
-    use[faces] = True
-    return np.flatnonzero(use), (np.cumsum(use) - 1)[faces].astype(np.int32)
+    used, number = used_numbers(faces, count), np.empty(count, np.int32)
+    number[used] = np.arange(len(used))
+    return used, number[faces]

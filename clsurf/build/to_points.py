@@ -86,7 +86,7 @@ def _spread(surface, near: NearCells, device: Device, report) -> tuple[NDArray, 
     """Return world positions and normals (n, 3) float64 of points, chosen part by part along the cells' curve."""
     spacing, sided = FINER * near.spacing, oriented(surface)
     rows = CHUNK // 8
-    positions, normals = np.zeros((0, 3)), np.zeros((0, 3))
+    parts = []  # box, positions and normals of what each part chose
     for start in range(0, len(near.parents), rows):
         report("points", start / len(near.parents))
         place, normal = _places(surface, near, slice(start, start + rows), device)
@@ -94,11 +94,19 @@ def _spread(surface, near: NearCells, device: Device, report) -> tuple[NDArray, 
             continue
         low, high = box_of(place)
         low, high = low - spacing, high + spacing
-        beside = ((positions >= low) & (positions <= high)).all(axis=1)
-        sides = (normal, normals[beside]) if sided else (np.zeros_like(normal), np.zeros_like(normals[beside]))
-        chosen = spread_out(place, sides[0], spacing, positions[beside], sides[1])
-        positions, normals = np.concatenate([positions, place[chosen]]), np.concatenate([normals, normal[chosen]])
-    return positions, normals
+        near_by = [part[1:] for part in parts if (part[0][0] <= high).all() and (part[0][1] >= low).all()]
+        taken, taken_normals = _joined(near_by)
+        beside = ((taken >= low) & (taken <= high)).all(axis=1)
+        sides = (normal, taken_normals[beside]) if sided else (np.zeros_like(normal), np.zeros((beside.sum(), 3)))
+        chosen = spread_out(place, sides[0], spacing, taken[beside], sides[1])
+        if len(chosen):
+            parts.append((box_of(place[chosen]), place[chosen], normal[chosen]))
+    return _joined([part[1:] for part in parts])
+
+
+def _joined(parts) -> tuple[NDArray, NDArray]:
+    empty = np.zeros((0, 3))
+    return tuple(np.concatenate([empty, *(part[k] for part in parts)]) for k in (0, 1))
 
 
 def _places(surface, near: NearCells, rows: slice, device: Device) -> tuple[NDArray, NDArray]:

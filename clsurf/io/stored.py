@@ -172,8 +172,9 @@ class StoredSurface:
 
     def _checked(self, name: str, shape: tuple, members: Members | None = None) -> "zarr.Array":
         """Return an array of the store, refused where it has another shape (-1: any) or cannot have it."""
+        import zarr
         array = self._group[name]
-        if not hasattr(array, "ndim") or array.ndim != len(shape) or any(
+        if not isinstance(array, zarr.Array) or array.ndim != len(shape) or any(
                 want not in (-1, got) for got, want in zip(array.shape, shape, strict=True)):
             raise FileFormatError(f"{self.place}: {name}: expected the shape {shape}, got "
                                   f"{getattr(array, 'shape', 'a group')}: damaged")

@@ -160,6 +160,11 @@ class SlimSurface:
                 f"{self.nbytes:,} bytes, bounds {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()})")
 
 
+def powers(u: NDArray, v: NDArray) -> NDArray:
+    """Return the terms (..., 10) of a cubic at places u, v in the order of the coefficients."""
+    return np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=-1)
+
+
 def frame_of_normals(normals) -> tuple[NDArray, NDArray]:
     """Return the axes u and v that complete unit normals to right-handed frames.
 
